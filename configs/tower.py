@@ -1,0 +1,16 @@
+"""Stack five blocks on a stand to match a goal picture (the paper's stacking-tower), with the default goal-aware agent.
+
+    python -m lala_jax.train --config=configs/tower.py                       # 500 demonstrations, 2 CPU cores
+    python -m lala_jax.train --config=configs/tower.py:smoke                 # every part, in minutes
+    python -m lala_jax.train --config=configs/tower.py:paper                 # the paper's two-stream agent, for a GPU
+    python -m lala_jax.train --config=configs/tower.py --config.task.num_objects=3
+
+Hardware, time and scores of the runs reported are in the README. The paper: 15.8 with 500 demonstrations (two streams, max-height map).
+"""
+
+from lala_jax import defaults
+
+
+def get_config(arg=""):
+    """Give the config; `arg` is "", "smoke" or "paper"."""
+    return defaults.get(arg, task="tower")

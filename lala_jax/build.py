@@ -1,0 +1,127 @@
+"""From a config to the objects it names: the door between config fields and keyword arguments."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from lala_jax import observe, optim, options, policy, train_step, types
+from lala_jax.models import goal_aware, transporter
+from lala_jax.sim import scene, tasks
+from lala_jax.sim.tasks import base
+
+MODELS = ("goal_aware", "single", "two_stream", "two_stream_lateral")
+SPLITS = ("train", "val", "test")
+TEST_START = 10_001
+
+
+def task(config: Mapping[str, Any]) -> base.Task:
+    """Build the task from the config's `task` group."""
+    fields = config["task"]
+    options.check_choice("task.name", fields["name"], tasks.names())
+    options.check_choice("task.colors", fields["colors"], base.PALETTES)
+    number = {"num_objects": fields["num_objects"]} if fields["num_objects"] else {}
+    try:
+        return tasks.get(fields["name"], colors=fields["colors"], **number)
+    except (ValueError, TypeError) as error:
+        raise options.OptionsError(str(error)) from error
+
+
+def task_options(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Give what identifies recorded demonstrations beside the task's name."""
+    built = task(config)
+    return {"num_objects": built.num_objects, "colors": built.colors}
+
+
+def map_spec(config: Mapping[str, Any]) -> types.MapSpec:
+    """Build the map's facts from the config's `map` group."""
+    try:
+        return types.MapSpec(**config["map"])
+    except ValueError as error:
+        raise options.OptionsError(str(error)) from error
+
+
+def observer(config: Mapping[str, Any]) -> observe.Observer:
+    """Build the observer from the groups `task`, `map` and `camera`; raises where a camera sees nothing."""
+    fields = config["camera"]
+    options.check_choice("camera.preset", fields["preset"], scene.PRESETS)
+    for name in ("height", "width"):
+        _positive(f"camera.{name}", fields[name])
+    built = observe.Observer(task=task(config), spec=map_spec(config), **fields)
+    built.check()
+    return built
+
+
+def build_policy(config: Mapping[str, Any]) -> policy.Policy:
+    """Build the policy from the groups `model` and `map`."""
+    fields, spec = config["model"], map_spec(config)
+    options.check_choice("model.name", fields["name"], MODELS)
+    for name in ("rotations", "crop", "channels", "width", "stages", "trunk_width", "tokens"):
+        _positive(f"model.{name}", fields[name])
+    shared = {"crop": fields["crop"], "channels": fields["channels"]}
+    if fields["name"] == "goal_aware":
+        if spec.rows % 4 or spec.cols % 4 or fields["crop"] % 4:
+            sizes = f"{spec.rows}, {spec.cols} and {fields['crop']}"
+            raise options.OptionsError(f"goal_aware needs map rows, map cols and model.crop in multiples of 4, got {sizes}")
+        model = goal_aware.GoalAware(
+            spec=spec, rotations=fields["rotations"], tokens=fields["tokens"], trunk_width=fields["trunk_width"],
+            trunk_blocks=fields["trunk_blocks"], fine_width=fields["width"], **shared,
+        )  # fmt: skip
+        choices = {name: fields[name] for name in ("multi_action", "match_weight", "refine")}
+        return policy.GoalAwarePolicy(model=model, **choices)
+    try:
+        net = transporter.Transporter(
+            variant=fields["name"], yaw_bins=fields["rotations"], width=fields["width"], stages=fields["stages"], **shared
+        )
+    except ValueError as error:
+        raise options.OptionsError(str(error)) from error
+    return policy.TransporterPolicy(model=net, spec=spec, multi_action=fields["multi_action"])
+
+
+def recipe(config: Mapping[str, Any]) -> train_step.Recipe:
+    """Build the training step's facts from the whole config."""
+    train, augment = config["train"], config["augment"]
+    for name in ("steps", "batch_size", "log_every", "save_every", "eval_every", "eval_episodes"):
+        _positive(f"train.{name}", train[name])
+    options.check_choice("optim.schedule", config["optim"]["schedule"], optim.SCHEDULES)
+    return train_step.Recipe(
+        policy=build_policy(config),
+        observer=observer(config),
+        optimizer=optim.create(config["optim"], steps=train["steps"]),
+        batch_size=train["batch_size"],
+        recolor=augment["recolor"],
+        rigid=augment["rigid"],
+        average_decay=config["optim"]["average_decay"],
+    )
+
+
+def input_spec(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Say what the policy expects to see, to be stored beside its parameters."""
+    spec = map_spec(config)
+    return {
+        "map": {"rows": spec.rows, "cols": spec.cols, "slices": spec.slices, "features": 3},
+        "x": list(spec.x), "y": list(spec.y), "z": list(spec.z), "cell": spec.cell,
+        "features": "RGB in 0..1, mean per voxel",
+    }  # fmt: skip
+
+
+def split_seeds(split: str, start: int, count: int) -> list[int]:
+    """Give `count` seeds of a split from its `start`-th on: train even, val odd, both below 10 000; test from 10001 on."""
+    options.check_choice("split", split, SPLITS)
+    if start < 0 or count < 1:
+        raise options.OptionsError(f"a seed range needs start >= 0 and at least one seed, got start={start}, count={count}")
+    if split == "test":
+        return [TEST_START + i for i in range(start, start + count)]
+    seeds = [2 * i + (split == "val") for i in range(start, start + count)]
+    if seeds[-1] >= TEST_START - 1:
+        most = math.ceil((TEST_START - 1) / 2)
+        raise options.OptionsError(f"the {split} split has {most} seeds, asked for {start}..{start + count - 1}")
+    return seeds
+
+
+def _positive(name: str, value: float) -> None:
+    if not np.isfinite(value) or value <= 0:
+        raise options.OptionsError(f"config field {name} must be above 0, got {value!r}")

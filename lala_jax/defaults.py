@@ -1,0 +1,117 @@
+"""Every field of a config with its default: the list that `configs/*.py` start from and `build` reads."""
+
+from __future__ import annotations
+
+import os
+
+import ml_collections
+
+ARGUMENTS = ("", "smoke", "paper")
+
+
+def get(arg: str, *, task: str) -> ml_collections.ConfigDict:
+    """Give the default config of a task; `arg` is one of ARGUMENTS: "" (2 CPU cores), "smoke" (every part, minutes), "paper" (GPU)."""
+    if arg not in ARGUMENTS:
+        raise ValueError(f"config argument must be one of {ARGUMENTS}, got {arg!r}")
+    config = ml_collections.ConfigDict()
+    config.seed = 0  # of the parameters and of every training step
+
+    config.task = ml_collections.ConfigDict()
+    config.task.name = task  # a name in sim.tasks
+    config.task.num_objects = 0  # 0: the task's own number
+    config.task.colors = "paper"  # a palette in sim.tasks.base.PALETTES
+
+    config.data = ml_collections.ConfigDict()
+    config.data.directory = f"data/{task}"  # demonstrations, collected there if there are none
+    config.data.demos = 500
+    config.data.threads = os.cpu_count() or 1  # of physics, in collection and evaluation
+
+    config.camera = ml_collections.ConfigDict()
+    config.camera.preset = "ring"  # a name in sim.scene.PRESETS
+    config.camera.height = 180  # pixels
+    config.camera.width = 240
+    config.camera.depth_noise = False
+
+    config.map = ml_collections.ConfigDict()
+    config.map.cell = 0.00625  # metres
+    config.map.slices = 14
+
+    config.model = ml_collections.ConfigDict()
+    config.model.name = "goal_aware"  # or single, two_stream, two_stream_lateral (the paper's)
+    config.model.rotations = 36
+    config.model.crop = 24  # cells; 64 for the paper's at full resolution
+    config.model.channels = 4  # of key and query
+    config.model.width = 24  # fine maps' channels (goal_aware), or the first stage's (the paper's: 64)
+    config.model.stages = 4  # of the paper's hourglass
+    config.model.trunk_width = 48
+    config.model.trunk_blocks = 3
+    config.model.tokens = 384  # goal voxels that the pick is matched with
+    config.model.multi_action = True  # supervise every right action, not one
+    config.model.match_weight = 1.0
+    config.model.refine = True  # regress below the cell and the bin
+
+    config.augment = ml_collections.ConfigDict()
+    config.augment.recolor = True
+    config.augment.rigid = True
+
+    config.optim = ml_collections.ConfigDict()
+    config.optim.schedule = "cosine"
+    config.optim.learning_rate = 1e-3
+    config.optim.warmup = 100  # steps
+    config.optim.weight_decay = 1e-4
+    config.optim.clip = 1.0  # of the gradient's global norm
+    config.optim.average_decay = 0.998  # of the parameters that are evaluated
+
+    config.train = ml_collections.ConfigDict()
+    config.train.steps = 3000
+    config.train.batch_size = 8
+    config.train.log_every = 20  # steps
+    config.train.save_every = 250
+    config.train.eval_every = 1000
+    config.train.eval_episodes = 20  # to choose the best checkpoint, val split
+
+    config.eval = ml_collections.ConfigDict()
+    config.eval.split = "val"
+    config.eval.start = 0  # the first episode's place in the split
+    config.eval.episodes = 100
+    config.eval.parallel = 25  # episodes observed at once
+    config.eval.strips = 4  # episodes drawn as strips of pictures
+    if arg == "smoke":
+        _shrink(config)
+    if arg == "paper":
+        _enlarge(config)
+    return config
+
+
+def _shrink(config) -> None:
+    """Make every part run in a few minutes; the score means nothing."""
+    config.data.directory += "-smoke"
+    config.data.demos = 6
+    config.train.steps = 12
+    config.train.batch_size = 4
+    config.train.log_every = 2
+    config.train.save_every = 6
+    config.train.eval_every = 6
+    config.train.eval_episodes = 2
+    config.optim.warmup = 2
+    config.eval.episodes = 4
+    config.eval.parallel = 4
+    config.eval.strips = 2
+
+
+def _enlarge(config) -> None:
+    """The paper's policy at the paper's size: two streams, one-hot labels, Adam 1e-4, batch 1, 20 K steps. Meant for a GPU."""
+    config.camera.height, config.camera.width = 480, 640
+    config.map.cell = 0.003125
+    config.model.name = "two_stream"
+    config.model.crop = 64
+    config.model.channels = 3
+    config.model.width = 64
+    config.model.multi_action = False
+    config.optim.schedule = "constant"
+    config.optim.learning_rate = 1e-4
+    config.optim.weight_decay = 0.0
+    config.train.steps = 20_000
+    config.train.batch_size = 1
+    config.train.eval_every = 5000
+    config.eval.parallel = 4

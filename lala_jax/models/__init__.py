@@ -1,0 +1,1 @@
+"""Networks: maps in, pick and place logits out."""

@@ -1,0 +1,116 @@
+"""The residual hourglass of Transporter Networks and CLIPort, at the paper's width or a smaller one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+
+MIN_HEAD = 4  # channels: with fewer, narrow networks start with all of them below zero too often
+
+
+class ResidualBlock(nn.Module):
+    """Add a 1x1 - 3x3 - 1x1 branch to the input, or to its strided 1x1 projection where `project` is set.
+
+    Nothing normalises and nothing has a bias. The stride is taken by the 3x3, as in CLIPort.
+    """
+
+    mid: int  # channels of the first two convolutions
+    out: int  # channels of the last
+    stride: int = 1
+    project: bool = False
+    last_relu: bool = True
+    dtype: jnp.dtype = jnp.float32
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """Map `[..., H, W, C]` to `[..., H / stride, W / stride, out]`."""
+        conv = self._conv
+        y = nn.relu(conv(self.mid, 1, "reduce")(x))
+        y = nn.relu(conv(self.mid, 3, "middle", self.stride)(y))
+        y = conv(self.out, 1, "expand")(y)
+        shortcut = conv(self.out, 1, "shortcut", self.stride)(x) if self.project else x
+        return nn.relu(y + shortcut) if self.last_relu else y + shortcut
+
+    def _conv(self, features: int, size: int, name: str, stride: int = 1) -> nn.Conv:
+        kernel, strides = (size, size), (stride, stride)
+        return nn.Conv(features, kernel, strides, padding=size // 2, use_bias=False, dtype=self.dtype, name=name)
+
+
+class ResNet43_8s(nn.Module):
+    """Predict `out` values a cell with an hourglass of residual pairs: the paper's network by default.
+
+    `stages` pairs of `width`, `2 * width`, ... channels, all but the first halving the image; then as many pairs less
+    one with falling width, each followed by a doubling of the image; then a pair of `width / 4` channels that ends in
+    `out`. The default has 9.82 M parameters (Transporter Networks, appendix; CLIPort's `ResNet43_8s`).
+
+    Two things differ from CLIPort. Its doubling stretches corner to corner, this one keeps cells over the cells that the
+    strides took. And its last pair has a ReLU between its two blocks, where `out` channels are left: for one channel,
+    2 of 8 seeds start with it negative everywhere, an output of zero that no gradient reaches. `head_relu` restores it.
+
+    Raises ValueError for an image whose sides the strides do not divide.
+    """
+
+    out: int
+    width: int = 64
+    stages: int = 4
+    dtype: jnp.dtype = jnp.float32
+    head_relu: bool = False
+
+    @nn.compact
+    def __call__(self, x: jax.Array, laterals: Sequence[jax.Array] | None = None) -> tuple[jax.Array, list[jax.Array]]:
+        """Map `[..., H, W, C]` to `[..., H, W, out]`, and give the decoder's features, coarse to fine, besides.
+
+        `laterals`, another network's decoder features, are concatenated to this one's, and a 1x1 convolution restores
+        the width.
+        """
+        check_sides(x.shape, self.stages)
+        x = nn.relu(nn.Conv(self.width, (3, 3), padding=1, dtype=self.dtype, name="stem")(x))
+        for stage in range(self.stages):
+            x = self._pair(x, self.width << stage, f"down{stage}", stride=2 if stage else 1)
+        decoded = []
+        for level, stage in enumerate(reversed(range(self.stages - 1))):
+            x = upsample(self._pair(x, self.width << stage, f"up{stage}"))
+            if laterals is not None:
+                x = jnp.concatenate([x, laterals[level].astype(x.dtype)], -1)
+                x = nn.Conv(self.width << stage, (1, 1), dtype=self.dtype, name=f"lateral{stage}")(x)
+            decoded.append(x)
+        x = self._pair(x, max(self.width // 4, MIN_HEAD), "head", self.out, relus=(self.head_relu, False))
+        return x, decoded
+
+    def _pair(
+        self,
+        x: jax.Array,
+        width: int,
+        name: str,
+        out: int | None = None,
+        *,
+        stride: int = 1,
+        relus: tuple[bool, bool] = (True, True),
+    ) -> jax.Array:
+        out = width if out is None else out
+        x = ResidualBlock(width, out, stride, True, relus[0], self.dtype, name=f"{name}_project")(x)
+        return ResidualBlock(width, out, 1, False, relus[1], self.dtype, name=f"{name}_identity")(x)
+
+
+def check_sides(shape: Sequence[int], stages: int) -> None:
+    """Raise ValueError unless an image `[..., H, W, C]` of this shape survives `stages - 1` halvings."""
+    step = 2 ** (stages - 1)
+    if len(shape) < 3 or shape[-3] % step or shape[-2] % step:
+        raise ValueError(f"an hourglass of {stages} stages needs [..., H, W, C] with sides divisible by {step}, got {tuple(shape)}")
+
+
+def upsample(x: jax.Array) -> jax.Array:
+    """Double the sides of `[..., H, W, C]` bilinearly: even cells copy, odd cells average their neighbours, the last repeats.
+
+    A convolution of stride 2 centres its output on even cells, so this puts every value back over the cell it is about.
+    """
+    for axis in (-3, -2):
+        axis = x.ndim + axis
+        last = jax.lax.slice_in_dim(x, x.shape[axis] - 1, None, axis=axis)
+        after = jnp.concatenate([jax.lax.slice_in_dim(x, 1, None, axis=axis), last], axis)
+        pairs = jnp.stack([x, (x + after) / 2], axis + 1)
+        x = pairs.reshape(*x.shape[:axis], 2 * x.shape[axis], *x.shape[axis + 1 :])
+    return x

@@ -1,0 +1,145 @@
+"""The paper's policy: pick map, query of rotated crops about the pick, key map, and their correlation.
+
+The rotation and the correlation have no parameters and are plain functions; the module only composes them. As in the
+paper, the query sees the goal image *at the pick cell*, which in these tasks is bare table once the goal is reached.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+from jaxtyping import Array, ArrayLike, Float, Int
+
+from lala_jax.models import correlation, streams
+from lala_jax.perception import image
+
+# CLIPort's constants for a tabletop: colours in 0..1, heights in metres.
+COLOR_MEAN, COLOR_STD = 0.18877631, 0.07276466
+HEIGHT_MEAN, HEIGHT_STD = 0.00509261, 0.00903967
+
+
+def normalise(max_height: Float[Array, "rows cols c"]) -> Float[Array, "rows cols c"]:
+    """Normalise a max-height map, channels (r, g, b, any fused features, height in metres), by CLIPort's statistics.
+
+    Colour and height get about zero mean and unit deviation over a tabletop scene; fused features pass as they are.
+    """
+    color, features, height = jnp.split(max_height, (3, max_height.shape[-1] - 1), axis=-1)
+    color, height = (color - COLOR_MEAN) / COLOR_STD, (height - HEIGHT_MEAN) / HEIGHT_STD
+    return jnp.concatenate([color, features, height], axis=-1)
+
+
+def pick_crops(
+    maps: Float[Array, "rows cols c"], pick_cell: Int[Array, 2], *, yaw_bins: int, crop: int
+) -> Float[Array, "k crop crop c"]:
+    """Cut `yaw_bins` crops about the cell with integer `(row, col)`, crop `b` turned by `+2 pi b / yaw_bins` about world z.
+
+    The cell lands on index `crop // 2`, where `correlation.correlate` looks for a kernel's centre.
+    """
+    return image.rotate_crop(maps, pick_cell.astype(jnp.float32) + 0.5, yaw_bins, crop)
+
+
+def place_logits(
+    key: Float[Array, "padded_rows padded_cols d"], query: Float[Array, "k crop crop d"], *, scale: float, method: str = "auto"
+) -> Float[Array, "k rows cols"]:
+    """Correlate a key map that was padded by `crop // 2` on each side with the query crops, cut to the map, times `scale`.
+
+    `out[b, i, j]` is the score of putting the pick cell onto cell `(i, j)`, turned by `2 pi b / k`.
+    """
+    margin = query.shape[1] // 2
+    scores = correlation.correlate(key, query, method=method)
+    return scale * scores[:, margin : scores.shape[1] - margin, margin : scores.shape[2] - margin]
+
+
+class Transporter(nn.Module):
+    """Goal-conditioned Transporter (LALA) in its three variants; unbatched, float32 logits.
+
+    The defaults are the paper's: 64 x 64 crops, 36 rotations, three channels of key and query. A smaller `width`,
+    `stages` and `crop` make a compact one. Raises ValueError for an unknown `variant`, for a crop that the strides do
+    not divide and for fewer than one rotation.
+    """
+
+    variant: str = "two_stream"  # one of streams.VARIANTS
+    yaw_bins: int = 36
+    crop: int = 64  # cells
+    channels: int = 3  # of key and query
+    width: int = 64  # channels of the first stage
+    stages: int = 4
+    method: str = "auto"  # one of correlation.METHODS
+    dtype: jnp.dtype = jnp.float32  # what the networks compute in
+
+    def __post_init__(self):
+        for name, valid in (("variant", streams.VARIANTS), ("method", correlation.METHODS)):
+            if getattr(self, name) not in valid:
+                raise ValueError(f"Transporter.{name} must be one of {valid}, got {getattr(self, name)!r}")
+        step = 2 ** (self.stages - 1)
+        if self.crop < 1 or self.crop % step:
+            raise ValueError(f"Transporter.crop must be a positive multiple of {step} for {self.stages} stages, got {self.crop}")
+        if self.yaw_bins < 1:
+            raise ValueError(f"Transporter.yaw_bins must be at least 1, got {self.yaw_bins}")
+        super().__post_init__()
+
+    def setup(self):
+        self.pick_net = self._streams(1, "add")
+        self.key_net = self._streams(self.channels, "conv")
+        self.query_net = self._streams(self.channels, "conv")
+
+    def _streams(self, out: int, fusion: str) -> streams.Streams:
+        return streams.Streams(out, self.variant, fusion, self.width, self.stages, self.dtype)
+
+    def __call__(
+        self, current: Float[Array, "rows cols c"], goal: Float[Array, "rows cols c"], pick_cell: Int[ArrayLike, 2] | None = None
+    ) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
+        """Score every pick and, for the pick at integer `(row, col)`, every place: `(logits, intermediates)`.
+
+        `logits` has `pick` `[rows, cols]` and `place` `[yaw_bins, rows, cols]`, each for one softmax over all its entries.
+        Without a `pick_cell` the best pick is taken; `intermediates` names the cell, the key map and the query crops.
+        """
+        pick = self.pick(current, goal)
+        if pick_cell is None:
+            pick_cell = jnp.stack(jnp.unravel_index(jnp.argmax(pick), pick.shape))
+        place, intermediates = self.place(current, goal, jnp.asarray(pick_cell))
+        return {"pick": pick, "place": place}, intermediates
+
+    def pick(self, current: Float[Array, "rows cols c"], goal: Float[Array, "rows cols c"]) -> Float[Array, "rows cols"]:
+        """Score every cell as a pick; the maps are padded to a square, as in the paper."""
+        rows, cols = current.shape[:2]
+        side = self._round_up(max(rows, cols))
+        top, left = (side - rows) // 2, (side - cols) // 2
+        logits = self.pick_net(*(_pad(x, (top, side - rows - top), (left, side - cols - left)) for x in (current, goal)))
+        return logits[top : top + rows, left : left + cols, 0]
+
+    def place(
+        self, current: Float[Array, "rows cols c"], goal: Float[Array, "rows cols c"], pick_cell: Int[Array, 2]
+    ) -> tuple[Float[Array, "k rows cols"], dict[str, jax.Array]]:
+        """Score every place of what is at `pick_cell`: `([yaw_bins, rows, cols], intermediates)`."""
+        maps = pick_crops(jnp.concatenate([current, goal], -1), pick_cell, yaw_bins=self.yaw_bins, crop=self.crop)
+        query = self.query(*jnp.split(maps, 2, axis=-1))
+        key = self.key(current, goal)
+        scale = self.crop**-2 * self.channels**-0.5
+        logits = place_logits(key, query, scale=scale, method=self.method)
+        return logits, {"pick_cell": pick_cell, "key": key, "query": query}
+
+    def key(
+        self, current: Float[Array, "rows cols c"], goal: Float[Array, "rows cols c"]
+    ) -> Float[Array, "padded_rows padded_cols d"]:
+        """Give the key map, `crop // 2` cells larger on each side so that places at the border see whole kernels."""
+        rows, cols = current.shape[:2]
+        margin = self.crop // 2
+        extra = self._round_up(rows) - rows, self._round_up(cols) - cols
+        key = self.key_net(*(_pad(x, (margin, margin + extra[0]), (margin, margin + extra[1])) for x in (current, goal)))
+        return key[: rows + 2 * margin, : cols + 2 * margin]
+
+    def query(
+        self, current: Float[Array, "k crop crop c"], goal: Float[Array, "k crop crop c"]
+    ) -> Float[Array, "k crop crop d"]:
+        """Give the query kernels of rotated crops of both maps."""
+        return self.query_net(current, goal)
+
+    def _round_up(self, cells: int) -> int:
+        step = 2 ** (self.stages - 1)
+        return -(-cells // step) * step
+
+
+def _pad(x: jax.Array, rows: tuple[int, int], cols: tuple[int, int]) -> jax.Array:
+    return jnp.pad(x, (rows, cols, (0, 0)))

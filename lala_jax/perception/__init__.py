@@ -1,0 +1,1 @@
+"""From posed depth images to top-down maps: pure functions on arrays."""

@@ -1,0 +1,55 @@
+"""Resampling of maps and images: bilinear reads and rotated crops. Pure and unbatched."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Num
+
+
+def sample(image: Float[Array, "rows cols c"], at: Float[Array, "... 2"]) -> Float[Array, "... c"]:
+    """Read an image bilinearly at continuous `(row, col)` `[..., 2]` (the centre of `[i, j]` is `(i + 0.5, j + 0.5)`), zero outside."""
+    rows, cols, channels = image.shape
+    low = jnp.floor(at - 0.5)
+    frac = at - 0.5 - low
+    row, col = low[..., 0].astype(jnp.int32), low[..., 1].astype(jnp.int32)
+    flat = image.reshape(rows * cols, channels)
+    out = jnp.zeros(at.shape[:-1] + (channels,), image.dtype)
+    for down in (0, 1):
+        for right in (0, 1):
+            i, j = row + down, col + right
+            weight = jnp.abs(1 - down - frac[..., 0]) * jnp.abs(1 - right - frac[..., 1])
+            inside = (i >= 0) & (i < rows) & (j >= 0) & (j < cols)
+            weight = jnp.where(inside, weight, 0.0).astype(image.dtype)
+            index = jnp.clip(i, 0, rows - 1) * cols + jnp.clip(j, 0, cols - 1)
+            out += flat.at[index].get(mode="promise_in_bounds") * weight[..., None]
+    return out
+
+
+def rotation_offsets(yaw_bins: int, size: int) -> np.ndarray:
+    """Give `[k, size, size, 2]` offsets `(row, col)` in cells at which each rotated crop reads, relative to its centre.
+
+    Crop `b` shows the content turned by `+2 pi b / k` about world z (row runs along +y, col along +x), so it reads at
+    the inverse turn of its own offset; the turning point is the centre of crop cell `[size // 2, size // 2]`.
+    """
+    theta = (2 * math.pi / yaw_bins * np.arange(yaw_bins))[:, None, None]
+    y, x = np.meshgrid(np.arange(size) - size // 2, np.arange(size) - size // 2, indexing="ij")
+    cos, sin = np.cos(theta), np.sin(theta)
+    return np.stack([cos * y - sin * x, cos * x + sin * y], axis=-1)
+
+
+def rotate_crop(
+    image: Float[Array, "rows cols c"], center: Num[Array | np.ndarray, " 2"] | Sequence, yaw_bins: int, size: int
+) -> Float[Array, "k size size c"]:
+    """Give `k = yaw_bins` crops `[k, size, size, C]` of an image about a continuous `(row, col)`, crop `b` turned by `+2 pi b / k`.
+
+    Crop `b` is what the picture of an object held at `center` looks like after a right-handed turn of `2 pi b / k` about world z.
+    The centre lands on the centre of crop cell `[size // 2, size // 2]`: give `(i + 0.5, j + 0.5)` to turn about
+    cell `[i, j]`. Bilinear, zero outside the image.
+    """
+    offsets = jnp.asarray(rotation_offsets(yaw_bins, size), jnp.float32)
+    center = jnp.broadcast_to(jnp.asarray(center, jnp.float32), offsets.shape)
+    return sample(image, center + offsets)

@@ -1,0 +1,259 @@
+"""Policies: a network, its loss and its action, behind one interface for training and closed loop. Pure and unbatched.
+
+A policy is a static, hashable object; its parameters travel beside it. `init(key)`, `loss(params, key, state, current, goal)` and
+`act(params, current, goal)` are all that training and evaluation know of it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from lala_jax import losses, types
+from lala_jax.models import goal_aware, transporter
+from lala_jax.perception import topdown
+
+SURFACE_RADIUS = 2  # cells about a point within which its height is the highest seen
+TOKEN_TOLERANCE = 0.008  # metres a goal voxel's centre may be outside the object it shows
+
+
+@struct.dataclass
+class Heatmaps:
+    """What a policy thought, for pictures and diagnoses."""
+
+    pick: jax.Array  # [rows, cols] logits
+    place: jax.Array  # [k, rows, cols] logits
+
+
+def empty_map(spec: types.MapSpec, *, features: int = 3) -> types.TopDownMap:
+    """Give a map in which nothing was seen."""
+    grid = (spec.rows, spec.cols, spec.slices)
+    return types.TopDownMap(features=jnp.zeros((*grid, features)), count=jnp.zeros(grid), height=jnp.zeros(grid[:2]))
+
+
+def argmax_index(logits: jax.Array) -> tuple[jax.Array, ...]:
+    """Give the int32 index of the largest entry along every axis."""
+    return tuple(i.astype(jnp.int32) for i in jnp.unravel_index(jnp.argmax(logits), logits.shape))
+
+
+def surface_height(current: types.TopDownMap, cell: jax.Array) -> jax.Array:
+    """Give the height `[]` in metres above z_min of the highest point seen within `SURFACE_RADIUS` cells of `cell` `[2]`."""
+    size = 2 * SURFACE_RADIUS + 1
+    padded = jnp.pad(current.height, SURFACE_RADIUS)
+    return jax.lax.dynamic_slice(padded, (cell[0], cell[1]), (size, size)).max()
+
+
+def _to_action(spec, current, pick, place_xy, yaw):
+    pick_xy = types.world_from_index(spec, pick)
+    place_cell = jnp.clip(types.index_from_world(spec, place_xy), 0, jnp.array([spec.rows - 1, spec.cols - 1]))
+    return types.PickPlace(
+        pick=jnp.append(pick_xy, spec.z[0] + surface_height(current, pick)),
+        place=jnp.append(place_xy, spec.z[0] + surface_height(current, place_cell)),
+        yaw=jnp.mod(yaw + math.pi, 2 * math.pi) - math.pi,
+    )
+
+
+@struct.dataclass
+class Sample:
+    """What one training example asks: a pick drawn among the right ones and where it may go."""
+
+    pick_valid: jax.Array  # [rows, cols] bool: every right pick now
+    index: jax.Array  # [] the object of the drawn pick
+    pick: jax.Array  # [2] int32 the drawn cell
+    drawn: jax.Array  # [] bool: there was something to draw
+    place: losses.PlaceLabel
+    bins: jax.Array  # [S]
+    cells: jax.Array  # [S, 2]
+    valid: jax.Array  # [S]
+
+
+def draw(key: jax.Array, state: types.State, *, spec: types.MapSpec, rotations: int, candidates: jax.Array, multi_action: bool) -> Sample:
+    """Draw an object among `candidates` `[N]` bool, a cell of its visible top face, and say where it goes.
+
+    Without `multi_action` the drawn pick and its place of least turn are the only right ones (the paper's one-hot labels).
+    """
+    key_object, key_cell = jax.random.split(key)
+    cells = losses.pick_valid(state, spec=spec)
+    candidates = candidates & cells.any((1, 2))
+    index = jax.random.categorical(key_object, jnp.where(candidates, 0.0, -1e9))
+    flat = jax.random.categorical(key_cell, jnp.where(cells[index].ravel(), 0.0, -1e9))
+    pick = jnp.stack([flat // spec.cols, flat % spec.cols]).astype(jnp.int32)
+    label = losses.place_label(state, index, types.world_from_index(spec, pick))
+    bins, places, valid = losses.place_index(label, spec=spec, rotations=rotations)
+    pick_valid = (cells & state.ready[:, None, None]).any(0)
+    if not multi_action:
+        least = jnp.argmin(jnp.where(valid, jnp.abs(jnp.mod(label.yaw + math.pi, 2 * math.pi) - math.pi), jnp.inf))
+        valid = valid & (jnp.arange(valid.size) == least)
+        pick_valid = jnp.zeros_like(pick_valid).at[pick[0], pick[1]].set(True)
+    drawn = candidates.any()
+    return Sample(pick_valid, index, pick, drawn, label, bins, places, valid & drawn)
+
+
+def hits(sample: Sample, pick_logits: jax.Array, place_logits: jax.Array, *, spec: types.MapSpec, rotations: int) -> dict[str, jax.Array]:
+    """Score the arg maxima: share of right picks, and of places within 1 cm and 15 deg of a right one."""
+    row, col = argmax_index(pick_logits)
+    turn, place_row, place_col = argmax_index(place_logits)
+    xy = types.world_from_index(spec, jnp.stack([place_row, place_col]))
+    near = jnp.linalg.norm(sample.place.xy - xy, axis=-1) < 0.01
+    off = jnp.mod(sample.place.yaw - turn * (2 * math.pi / rotations) + math.pi, 2 * math.pi) - math.pi
+    right = sample.place.valid & near & (jnp.abs(off) < math.radians(15))
+    return {
+        "pick_right": jnp.where(sample.pick_valid.any(), sample.pick_valid[row, col], jnp.nan),
+        "place_right": jnp.where(sample.drawn, right.any(), jnp.nan),
+        "place_near": jnp.where(sample.drawn, (near & sample.place.valid).any(), jnp.nan),
+    }
+
+
+@dataclasses.dataclass(frozen=True)
+class GoalAwarePolicy:
+    """The default agent: `models.goal_aware` with multi-action, matching and refinement losses; the fields are ablation switches."""
+
+    model: goal_aware.GoalAware
+    multi_action: bool = True
+    match_weight: float = 1.0
+    refine_weight: float = 1.0
+    refine: bool = True
+
+    @property
+    def spec(self) -> types.MapSpec:
+        return self.model.spec
+
+    def init(self, key: jax.Array):
+        """Make the parameters."""
+        blank = empty_map(self.spec)
+        return self.model.init(key, blank, blank, jnp.zeros(2, jnp.int32))["params"]
+
+    def loss(self, params, key: jax.Array, state: types.State, current: types.TopDownMap, goal: types.TopDownMap):
+        """Give `(loss, metrics)` of one example; any object that is not yet placed may teach the place and the match."""
+        key_draw, key_match, key_refine = jax.random.split(key, 3)
+        variables, model, spec = {"params": params}, self.model, self.spec
+        candidates = state.ready if not self.multi_action else ~state.placed
+        sample = draw(
+            key_draw, state, spec=spec, rotations=model.rotations, candidates=candidates, multi_action=self.multi_action
+        )
+        match = model.apply(variables, current, goal, method="match")
+        place = model.apply(variables, current, goal, match, sample.pick, method="place")
+        terms = {
+            "pick": losses.masked_cross_entropy(match.pick, sample.pick_valid),
+            "place": losses.place_cross_entropy(place.logits, sample.bins, sample.cells, sample.valid),
+        }
+        if self.match_weight:
+            terms["match"], terms["next"], match_right = self._match_losses(key_match, state, match)
+        if self.refine:
+            terms["refine"], refine_error = self._refine_loss(variables, key_refine, sample, place)
+        total = terms["pick"] + terms["place"]
+        total += self.match_weight * (terms.get("match", 0.0) + terms.get("next", 0.0)) + self.refine_weight * terms.get("refine", 0.0)
+        metrics = {f"loss_{name}": value for name, value in terms.items()} | {"loss": total}
+        metrics |= hits(sample, match.pick, place.logits, spec=spec, rotations=model.rotations)
+        if self.match_weight:
+            metrics["match_right"] = match_right
+        if self.refine:
+            metrics["refine_error"] = refine_error
+        return total, metrics
+
+    def _match_losses(self, key, state, match):
+        """Match every unplaced object with its voxels in the goal, and tell the voxels that may be built next."""
+        spec, token = self.spec, match.token
+        xy = types.world_from_cell(spec, (token[:, :2] + 0.5) * goal_aware.POOL)
+        z = spec.z[0] + (token[:, 2:] + 0.5) * spec.slice_height
+        centres = jnp.concatenate([xy, z], axis=-1)
+        whose = losses.owner(centres, poses=state.goal, size=state.size, tolerance=TOKEN_TOLERANCE)
+        whose = jnp.where(match.token_valid, whose, -1)
+        cells = losses.pick_valid(state, spec=spec)
+        keys = jax.random.split(key, cells.shape[0])
+        embeddings = match.goal[token[:, 0], token[:, 1], token[:, 2]]
+
+        def one(key, index, valid):
+            flat = jax.random.categorical(key, jnp.where(valid.ravel(), 0.0, -1e9))
+            picked = match.current[flat // spec.cols // goal_aware.POOL, flat % spec.cols // goal_aware.POOL]
+            scores = jnp.where(match.token_valid, embeddings @ picked, -1e9)
+            own = whose == index
+            use = valid.any() & own.any() & ~state.placed[index]
+            return use, losses.masked_cross_entropy(scores, own), own[scores.argmax()]
+
+        use, loss, right = jax.vmap(one)(keys, jnp.arange(cells.shape[0]), cells)
+        total = jnp.maximum(use.sum(), 1)
+        upcoming = (whose >= 0) & state.ready[whose]
+        return (
+            (use * loss).sum() / total,
+            losses.masked_cross_entropy(match.token_next, upcoming),
+            jnp.where(use.any(), (use * right).sum() / total, jnp.nan),
+        )
+
+    def _refine_loss(self, variables, key, sample, place):
+        """Start a cell and a bin or so away from a right place and regress the way there."""
+        key_which, key_cell, key_bin = jax.random.split(key, 3)
+        model, spec = self.model, self.spec
+        which = jax.random.categorical(key_which, jnp.where(sample.valid, 0.0, -1e9))
+        cell = sample.cells[which] + jax.random.randint(key_cell, (2,), -1, 2)
+        cell = jnp.clip(cell, 0, jnp.array([spec.rows - 1, spec.cols - 1]))
+        turn = sample.bins[which] + jax.random.randint(key_bin, (), -1, 2)
+        target = types.cell_from_world(spec, sample.place.xy[which]) - (cell + 0.5)
+        yaw = sample.place.yaw[which] * (model.rotations / (2 * math.pi)) - turn
+        yaw = jnp.mod(yaw + model.rotations / 2, model.rotations) - model.rotations / 2
+        target = jnp.append(target, yaw)
+        guess = model.apply(variables, place, jnp.mod(turn, model.rotations), cell, method="refine")
+        use = sample.valid.any()
+        error = jnp.linalg.norm(guess[:2] - target[:2]) * spec.cell
+        return jnp.where(use, losses.huber(guess - target).sum(), 0.0), jnp.where(use, error, jnp.nan)
+
+    def act(self, params, current: types.TopDownMap, goal: types.TopDownMap) -> tuple[types.PickPlace, Heatmaps]:
+        """Choose an action: the best pick, its best place, refined below the cell and the bin."""
+        variables, model, spec = {"params": params}, self.model, self.spec
+        match = model.apply(variables, current, goal, method="match")
+        pick = jnp.stack(argmax_index(match.pick))
+        place = model.apply(variables, current, goal, match, pick, method="place")
+        turn, row, col = argmax_index(place.logits)
+        cell = jnp.stack([row, col])
+        offset = jnp.zeros(3)
+        if self.refine:
+            offset = jnp.clip(model.apply(variables, place, turn, cell, method="refine"), -2.0, 2.0)
+        xy = types.world_from_cell(spec, cell + 0.5 + offset[:2])
+        yaw = (turn + offset[2]) * (2 * math.pi / model.rotations)
+        return _to_action(spec, current, pick, xy, yaw), Heatmaps(match.pick, place.logits)
+
+
+@dataclasses.dataclass(frozen=True)
+class TransporterPolicy:
+    """The paper's agents: `models.transporter` on max-height maps, one-hot labels unless `multi_action`."""
+
+    model: transporter.Transporter
+    spec: types.MapSpec
+    multi_action: bool = False
+
+    def init(self, key: jax.Array):
+        """Make the parameters."""
+        blank = self._input(empty_map(self.spec))
+        return self.model.init(key, blank, blank, jnp.zeros(2, jnp.int32))["params"]
+
+    def _input(self, topdown_map):
+        return transporter.normalise(topdown.max_height(topdown_map))
+
+    def loss(self, params, key: jax.Array, state: types.State, current: types.TopDownMap, goal: types.TopDownMap):
+        """Give `(loss, metrics)` of one example: cross-entropy of pick and place (eqs. 4-6)."""
+        rotations = self.model.yaw_bins
+        sample = draw(
+            key, state, spec=self.spec, rotations=rotations, candidates=state.ready, multi_action=self.multi_action
+        )
+        logits, _ = self.model.apply({"params": params}, self._input(current), self._input(goal), sample.pick)
+        pick = losses.masked_cross_entropy(logits["pick"], sample.pick_valid & sample.drawn)
+        place = losses.place_cross_entropy(logits["place"], sample.bins, sample.cells, sample.valid)
+        metrics = {"loss_pick": pick, "loss_place": place, "loss": pick + place}
+        metrics |= hits(sample, logits["pick"], logits["place"], spec=self.spec, rotations=rotations)
+        return pick + place, metrics
+
+    def act(self, params, current: types.TopDownMap, goal: types.TopDownMap) -> tuple[types.PickPlace, Heatmaps]:
+        """Choose an action: the best pick cell and its best place cell and bin (eqs. 2 and 3)."""
+        logits, intermediates = self.model.apply({"params": params}, self._input(current), self._input(goal))
+        turn, row, col = argmax_index(logits["place"])
+        xy = types.world_from_index(self.spec, jnp.stack([row, col]))
+        yaw = turn * (2 * math.pi / self.model.yaw_bins)
+        action = _to_action(self.spec, current, intermediates["pick_cell"].astype(jnp.int32), xy, yaw)
+        return action, Heatmaps(logits["pick"], logits["place"])
+
+
+Policy = GoalAwarePolicy | TransporterPolicy

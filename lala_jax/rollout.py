@@ -1,0 +1,149 @@
+"""Closed loop: scenes, an agent, the real primitive and the oracle's judgement. Many episodes step in parallel threads."""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from lala_jax import types
+from lala_jax.perception import transforms
+from lala_jax.sim import oracle, physics
+from lala_jax.sim.tasks import base
+
+# Given the indices of the running episodes and their object poses [E, N, 7], an action for each; None gives the episode up.
+Agent = Callable[[Sequence[int], np.ndarray], Sequence[types.PickPlace | None]]
+
+CAUSES = ("right", "missed pick", "lost on the way", "wrong object", "knocked over", "wrong yaw", "wrong height", "wrong place")
+
+
+@dataclasses.dataclass
+class Episode:
+    """What happened in one episode of T actions; states are settled, leaves have T + 1 entries."""
+
+    seed: int
+    scene: types.Scene
+    poses: list[np.ndarray]  # [N, 7] each
+    placed: list[np.ndarray]  # [N] bool each
+    ready: list[np.ndarray]  # [N] bool each
+    actions: list[types.PickPlace]  # T
+    outcomes: list[physics.Outcome]  # T
+    causes: list[str]  # T, each in CAUSES
+
+    @property
+    def score(self) -> float:
+        """Give the share of placed objects at the end, 0..100."""
+        return 100.0 * float(self.placed[-1].mean())
+
+    @property
+    def complete(self) -> bool:
+        return bool(self.placed[-1].all())
+
+    def demo(self) -> types.Demo:
+        """Give the record of this episode."""
+        actions = [np.concatenate([a.pick, a.place, [a.yaw]]) for a in self.actions]
+        flat = np.asarray(actions, np.float32).reshape(-1, 7)
+        return types.Demo(
+            scene=self.scene,
+            poses=np.asarray(self.poses, np.float32),
+            action=types.PickPlace(pick=flat[:, :3], place=flat[:, 3:6], yaw=flat[:, 6]),
+            placed=np.asarray(self.placed),
+            ready=np.asarray(self.ready),
+            seed=np.int64(self.seed),
+            score=np.float32(self.score),
+        )
+
+
+def run(
+    task: base.Task, scenes: Sequence[types.Scene], seeds: Sequence[int], agent: Agent, *, threads: int, max_actions: int | None = None
+) -> list[Episode]:
+    """Let `agent` act in every scene until the oracle says complete, the budget is spent or the agent gives up."""
+    worlds = [physics.World(task, scene) for scene in scenes]
+    episodes = [Episode(int(seed), scene, [], [], [], [], [], []) for seed, scene in zip(seeds, scenes, strict=True)]
+    for episode, world in zip(episodes, worlds, strict=True):
+        _record(task, episode, world.poses())
+    running = [i for i, episode in enumerate(episodes) if not episode.complete]
+    stepper = physics.Worlds(worlds, threads=threads)
+    for _ in range(task.max_actions if max_actions is None else max_actions):
+        if not running:
+            break
+        chosen = agent(running, np.stack([episodes[i].poses[-1] for i in running]))
+        actions: list[types.PickPlace | None] = [None] * len(worlds)
+        for i, action in zip(running, chosen, strict=True):
+            actions[i] = action
+        outcomes = stepper.step(actions)
+        running = [i for i in running if _advance(task, episodes[i], worlds[i], actions[i], outcomes[i])]
+    return episodes
+
+
+def _advance(task, episode, world, action, outcome) -> bool:
+    """Record one action; say whether the episode goes on."""
+    if action is None:
+        return False
+    ready = episode.ready[-1]
+    _record(task, episode, world.poses())
+    episode.actions.append(action)
+    episode.outcomes.append(outcome)
+    episode.causes.append(cause(episode.scene, ready, episode.placed[-2], episode.placed[-1], episode.poses[-1], outcome))
+    return not episode.complete
+
+
+def _record(task, episode, poses) -> None:
+    episode.poses.append(poses)
+    episode.placed.append(oracle.placed(task, episode.scene, poses))
+    episode.ready.append(oracle.ready(task, episode.scene, poses))
+
+
+def cause(
+    scene: types.Scene, ready: np.ndarray, before: np.ndarray, after: np.ndarray, poses: np.ndarray, outcome: physics.Outcome
+) -> str:
+    """Say how one action went, one of CAUSES; `ready`, `before` (placed), `after` are `[N]` bool."""
+    index = outcome.object
+    if index < 0:
+        return "missed pick"
+    if not outcome.held_to_place:
+        return "lost on the way"
+    if (before & ~after).any():
+        return "knocked over"
+    if after[index]:
+        return "right"
+    if not ready[index]:
+        return "wrong object"
+    goal, pose = np.asarray(scene.goal[index], float), poses[index]
+    if np.linalg.norm(goal[:2] - pose[:2]) >= oracle.PLANAR:
+        return "wrong place"
+    off = transforms.wrap_angle(transforms.yaw_from_quat(goal[3:]) - transforms.yaw_from_quat(pose[3:]), float(scene.symmetry[index]))
+    return "wrong yaw" if abs(off) >= oracle.TURN else "wrong height"
+
+
+def oracle_agent(task: base.Task, scenes: Sequence[types.Scene], seeds: Sequence[int], *, blind: bool = False) -> Agent:
+    """Make the oracle an agent, or the blind one that knows the places but not what belongs there."""
+    choose = oracle.blind if blind else oracle.act
+    rngs = [np.random.default_rng([seed, 1]) for seed in seeds]
+
+    def agent(indices, poses):
+        return [choose(task, scenes[i], pose, rngs[i]) for i, pose in zip(indices, poses, strict=True)]
+
+    return agent
+
+
+def summary(episodes: Sequence[Episode]) -> dict:
+    """Sum up scores: mean with a 95% interval, complete rate, actions by cause, failed picks by reason, and each episode's line."""
+    scores = np.array([episode.score for episode in episodes])
+    half = 1.96 * scores.std(ddof=1) / np.sqrt(len(scores)) if len(scores) > 1 else float("nan")
+    causes = collections.Counter(cause for episode in episodes for cause in episode.causes)
+    reasons = collections.Counter(outcome.reason for episode in episodes for outcome in episode.outcomes if not outcome.ok)
+    return {
+        "episodes": len(episodes),
+        "score": float(scores.mean()),
+        "interval95": [float(max(scores.mean() - half, 0.0)), float(min(scores.mean() + half, 100.0))],
+        "complete_percent": 100.0 * float(np.mean([episode.complete for episode in episodes])),
+        "actions": int(sum(len(episode.actions) for episode in episodes)),
+        "actions_by_cause": {cause: causes[cause] for cause in CAUSES},
+        "failures_by_reason": dict(reasons),
+        "per_episode": [
+            {"seed": e.seed, "score": e.score, "complete": e.complete, "actions": len(e.actions), "causes": e.causes} for e in episodes
+        ],
+    }

@@ -1,0 +1,1 @@
+"""The simulated robot: scene, tasks, physics, oracle and renderer."""

@@ -1,0 +1,163 @@
+"""What a task is, and the free, reachable poses that every task samples from."""
+
+from __future__ import annotations
+
+import dataclasses
+import zlib
+from typing import ClassVar
+
+import numpy as np
+
+from lala_jax import types
+from lala_jax.perception import transforms
+from lala_jax.sim import robot
+from lala_jax.sim.tasks import geometry
+
+COLORS = {
+    "blue": (78, 121, 167),
+    "red": (255, 87, 89),
+    "green": (89, 169, 79),
+    "orange": (242, 142, 43),
+    "yellow": (237, 201, 72),
+    "purple": (176, 122, 161),
+    "pink": (255, 157, 167),
+    "cyan": (118, 183, 178),
+    "brown": (156, 117, 95),
+    "white": (255, 255, 255),
+    "gray": (186, 176, 172),
+}
+PALETTES = {"paper": tuple(COLORS), "code": tuple(name for name in COLORS if name != "brown")}
+
+WORKSPACE = types.MapSpec()
+MARGIN = 0.015  # metres between the footprints of two objects at the start
+BORDER = 0.01  # metres between a footprint and the edge of the workspace
+CARRY = 0.32  # metres, how far an object is lifted above the table by the primitive
+HOVER = 0.10  # metres, at least so far above a goal the arm must reach
+TRIES = 128  # candidate poses an object gets in one attempt
+_FIRST = 8  # candidates looked at before the others
+ATTEMPTS = 20  # fresh starts before `NoFreePose`
+
+
+class NoFreePose(RuntimeError):
+    """No free pose was found within the bounded number of tries."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Area:
+    """Where objects are drawn: footprints inside a rectangle, centres where the arm reaches from the table up to `height`. In metres."""
+
+    x: tuple[float, float]
+    y: tuple[float, float]
+    height: float
+
+    def holds(self, poses: np.ndarray, size: np.ndarray) -> np.ndarray:
+        """Say for `poses` `[..., 7]` whether the footprint of a box of `size` `[3]` lies inside."""
+        low, high = np.array([self.x[0], self.y[0]]) + BORDER, np.array([self.x[1], self.y[1]]) - BORDER
+        xy, half = poses[..., :2], geometry.extent(poses, size)[..., :2]
+        inside = ((xy - half >= low) & (xy + half <= high)).all(-1)
+        for z in (0.0, self.height):
+            inside &= robot.reachable(np.concatenate([xy, np.full((*xy.shape[:-1], 1), z)], axis=-1))
+        return inside
+
+
+def free_pose(
+    rng: np.random.Generator, size: np.ndarray, area: Area, others: np.ndarray, other_size: np.ndarray, *, tries: int = TRIES
+) -> np.ndarray | None:
+    """Draw a pose `[7]` on the table of a box of `size` `[3]`, any yaw, clear of `others` `[K, 7]` by `MARGIN`; None if none is free."""
+    xy = rng.uniform([area.x[0], area.y[0]], [area.x[1], area.y[1]], (tries, 2))
+    poses = transforms.pose_from_yaw(np.concatenate([xy, np.full((tries, 1), size[2] / 2)], -1), rng.uniform(-np.pi, np.pi, tries))
+    poses = poses[area.holds(poses, size)]
+    for part in (poses[:_FIRST], poses[_FIRST:]):  # one of the first is nearly always free
+        free = (geometry.gap(part[:, None], size, others, other_size) >= MARGIN).all(-1)
+        if free.any():
+            return part[np.argmax(free)]
+    return None
+
+
+def free_poses(
+    rng: np.random.Generator, size: np.ndarray, area: Area, *, order: np.ndarray, others: np.ndarray, other_size: np.ndarray
+) -> np.ndarray:
+    """Draw poses `[N, 7]` of boxes of `size` `[N, 3]`, one after another in `order`, clear of each other and of `others` `[K, 7]`.
+
+    Raises `NoFreePose` after `ATTEMPTS` fresh starts of `TRIES` candidates an object.
+    """
+    index = 0
+    for _ in range(ATTEMPTS):
+        poses, done = np.zeros((len(size), 7)), []
+        for index in order:
+            taken = np.concatenate([others, poses[done]]), np.concatenate([other_size, size[done]])
+            found = free_pose(rng, size[index], area, *taken)
+            if found is None:
+                break
+            poses[index] = found
+            done.append(index)
+        else:
+            return poses
+    raise NoFreePose(
+        f"no free pose for object {index} of size {np.round(size[index], 4).tolist()} after {ATTEMPTS} attempts of {TRIES} tries in "
+        f"x {area.x}, y {area.y}, in reach up to z = {area.height:.3f} m, beside {len(size) - 1} other objects: use fewer or smaller ones"
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """The facts of a task; hashable, so that compiled models may be kept per task."""
+
+    num_objects: int
+    colors: str = "paper"  # a name in PALETTES
+    max_actions: int | None = None  # None: the task's own budget
+
+    name: ClassVar[str]
+    base_size: ClassVar[tuple[float, float, float]]  # full extents, metres
+    base_color: ClassVar[tuple[float, float, float]]  # RGB 0..1
+
+    def __post_init__(self):
+        if self.colors not in PALETTES:
+            raise ValueError(f"task {self.name}: colors={self.colors!r} is not one of {sorted(PALETTES)}")
+        if self.max_actions is None:
+            object.__setattr__(self, "max_actions", self.default_max_actions())
+        if self.max_actions < 1:
+            raise ValueError(f"task {self.name}: max_actions={self.max_actions} must be at least 1")
+
+    def default_max_actions(self) -> int:
+        """Give the action budget that the benchmark grants."""
+        raise NotImplementedError
+
+    def build(self, rng: np.random.Generator) -> types.Scene:
+        """Draw one scene in float64 numpy; `sample` seeds it and fixes the dtype."""
+        raise NotImplementedError
+
+    def object_mass(self, scene: types.Scene) -> np.ndarray:
+        """Give the objects' masses `[N]` in kilograms."""
+        raise NotImplementedError
+
+    def sample(self, seed: int) -> types.Scene:
+        """Give the scene of `seed` (at least 0), float32 numpy leaves: a pure function of the task's fields and the seed."""
+        if seed < 0:
+            raise ValueError(f"task {self.name}: seed={seed} must be at least 0")
+        scene = self.build(np.random.default_rng([seed, zlib.crc32(self.name.encode())]))
+        return types.Scene(**{field.name: np.asarray(getattr(scene, field.name), np.float32) for field in dataclasses.fields(scene)})
+
+    def draw_colors(self, rng: np.random.Generator, *, distinct: bool = True) -> np.ndarray:
+        """Draw the objects' RGB `[N, 3]` in 0..1 from the palette."""
+        names = PALETTES[self.colors]
+        if distinct and self.num_objects > len(names):
+            raise ValueError(f"task {self.name}: {self.num_objects} distinct colours asked of the {len(names)} in palette {self.colors!r}")
+        chosen = rng.choice(len(names), self.num_objects, replace=not distinct)
+        return np.array([COLORS[names[i]] for i in chosen]) / 255.0
+
+    def supports(self, scene: types.Scene) -> np.ndarray:
+        """Give `[N, N]` bool: `[i, j]` when goal pose i rests on goal pose j, so that j must be in place before i."""
+        goal, size = np.asarray(scene.goal, float), np.asarray(scene.size, float)
+        half = geometry.extent(goal, size)[:, 2]
+        touching = np.abs((goal[:, 2] - half)[:, None] - (goal[:, 2] + half)[None, :]) < 1e-3
+        return touching & (geometry.gap(goal[:, None], size[:, None], goal, size) < -1e-4)
+
+    def symmetries(self, scene: types.Scene) -> np.ndarray:
+        """Give how many yaws look the same `[N]`: 4 for a square box, 2 for another."""
+        return np.round(2 * np.pi / np.asarray(scene.symmetry)).astype(int)
+
+
+def color_name(rgb: np.ndarray) -> str:
+    """Name the palette colour nearest to `rgb` `[3]` in 0..1."""
+    return min(COLORS, key=lambda name: float(np.sum((np.array(COLORS[name]) / 255.0 - np.asarray(rgb)) ** 2)))

@@ -1,0 +1,74 @@
+"""One training step, from demonstrated states to new parameters, as one pure function: augment, render, fuse, learn."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from lala_jax import augment, observe, policy, state, types
+from lala_jax.sim.tasks import base
+
+
+@dataclasses.dataclass(frozen=True)
+class Recipe:
+    """The static facts of a training step; hashable."""
+
+    policy: policy.Policy
+    observer: observe.Observer
+    optimizer: optax.GradientTransformation
+    batch_size: int
+    recolor: bool = True
+    rigid: bool = True
+    average_decay: float = 0.998
+
+
+def palette() -> np.ndarray:
+    """Give the benchmark's colours `[P, 3]` in 0..1."""
+    return np.array(list(base.COLORS.values()), np.float32) / 255.0
+
+
+def augmented(recipe: Recipe, key: jax.Array, example: types.State) -> types.State:
+    """Recolour and move one example, scene and goal alike. Unbatched."""
+    key_color, key_rigid = jax.random.split(key)
+    if recipe.recolor:
+        example = augment.recolor(key_color, example, palette=jnp.asarray(palette()))
+    if recipe.rigid:
+        radius = float(np.linalg.norm(recipe.observer.task.base_size[:2])) / 2
+        example = augment.rigid(key_rigid, example, spec=recipe.observer.spec, base_radius=radius)
+    return example
+
+
+def observations(recipe: Recipe, key: jax.Array, examples: types.State) -> tuple[types.TopDownMap, types.TopDownMap]:
+    """Render and fuse B examples and their goals: maps with leaves `[B, ...]`."""
+    size = examples.color.shape[0]
+    both = jax.tree.map(lambda x: jnp.concatenate([x, x]), (examples.size, examples.color, examples.base))
+    poses = jnp.concatenate([examples.poses, examples.goal])
+    maps = recipe.observer.maps(*both, poses, key=key)
+    return jax.tree.map(lambda x: x[:size], maps), jax.tree.map(lambda x: x[size:], maps)
+
+
+def train_step(recipe: Recipe, run: state.TrainState, states: types.State, key: jax.Array) -> tuple[state.TrainState, dict[str, Any]]:
+    """Draw a batch from `states` (leaves `[M, ...]`), augment, render, fuse and take one optimiser step; metrics are batch means.
+
+    A pure function of its arguments: the randomness of step n is `fold_in(key, n)`. Metrics that an example
+    does not define are NaN there and left out of the mean.
+    """
+    key_batch, key_augment, key_noise, key_loss = jax.random.split(jax.random.fold_in(key, run.step), 4)
+    index = jax.random.randint(key_batch, (recipe.batch_size,), 0, states.size.shape[0])
+    examples = jax.tree.map(lambda leaf: leaf[index], states)
+    examples = jax.vmap(lambda k, e: augmented(recipe, k, e))(jax.random.split(key_augment, recipe.batch_size), examples)
+    current, goal = observations(recipe, key_noise, examples)
+    keys = jax.random.split(key_loss, recipe.batch_size)
+
+    def mean_loss(params):
+        losses, metrics = jax.vmap(lambda *example: recipe.policy.loss(params, *example))(keys, examples, current, goal)
+        return losses.mean(), jax.tree.map(jnp.nanmean, metrics)
+
+    (_, metrics), grads = jax.value_and_grad(mean_loss, has_aux=True)(run.params)
+    metrics["grad_norm"] = optax.global_norm(grads)
+    return state.update(run, grads, recipe.optimizer, average_decay=recipe.average_decay), metrics

@@ -1,0 +1,32 @@
+"""Settings that every test shares; they must be in place before JAX is first imported."""
+
+import os
+import pathlib
+import sys
+import tempfile
+
+import jaxtyping
+import pytest
+
+if "jax" in sys.modules:
+    raise RuntimeError("tests/conftest.py must run before jax is imported: a plugin or -p option imported it first")
+
+_CACHE = pathlib.Path(tempfile.gettempdir()) / f"lala_jax-compilation-cache-{os.getuid()}"
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(_CACHE))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # several test processes share one GPU
+
+# From here on, every call into perception checks the shapes and types that the signature states.
+jaxtyping.install_import_hook("lala_jax.perception", "beartype.beartype")
+
+
+def pytest_addoption(parser):
+    parser.addoption("--slow", action="store_true", help="also run the tests marked slow")
+
+
+def pytest_collection_modifyitems(config, items):
+    if config.getoption("--slow"):
+        return
+    for item in items:
+        if item.get_closest_marker("slow"):
+            item.add_marker(pytest.mark.skip(reason="slow: run with --slow"))
