@@ -45,7 +45,7 @@ def get(arg: str, *, task: str) -> ml_collections.ConfigDict:
     config.model.stages = 4  # of the paper's hourglass
     config.model.trunk_width = 48
     config.model.trunk_blocks = 3
-    config.model.tokens = 384  # goal voxels that the pick is matched with
+    config.model.tokens = 512  # goal voxels that the pick is matched with
     config.model.multi_action = True  # supervise every right action, not one
     config.model.match_weight = 1.0
     config.model.refine = True  # regress below the cell and the bin
@@ -63,11 +63,11 @@ def get(arg: str, *, task: str) -> ml_collections.ConfigDict:
     config.optim.average_decay = 0.998  # of the parameters that are evaluated
 
     config.train = ml_collections.ConfigDict()
-    config.train.steps = 3000
+    config.train.steps = 1600
     config.train.batch_size = 8
     config.train.log_every = 20  # steps
-    config.train.save_every = 250
-    config.train.eval_every = 1000
+    config.train.save_every = 200
+    config.train.eval_every = 800
     config.train.eval_episodes = 20  # to choose the best checkpoint, val split
 
     config.eval = ml_collections.ConfigDict()

@@ -165,12 +165,11 @@ class GoalAwarePolicy:
         whose = jnp.where(match.token_valid, whose, -1)
         cells = losses.pick_valid(state, spec=spec)
         keys = jax.random.split(key, cells.shape[0])
-        embeddings = match.goal[token[:, 0], token[:, 1], token[:, 2]]
 
         def one(key, index, valid):
             flat = jax.random.categorical(key, jnp.where(valid.ravel(), 0.0, -1e9))
             picked = match.current[flat // spec.cols // goal_aware.POOL, flat % spec.cols // goal_aware.POOL]
-            scores = jnp.where(match.token_valid, embeddings @ picked, -1e9)
+            scores = jnp.where(match.token_valid, match.token_embedding @ picked, -1e9)
             own = whose == index
             use = valid.any() & own.any() & ~state.placed[index]
             return use, losses.masked_cross_entropy(scores, own), own[scores.argmax()]

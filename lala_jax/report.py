@@ -108,12 +108,12 @@ def map_image(map: types.TopDownMap) -> np.ndarray:
 
     The first three features are the colour; cells where nothing was seen take the colour `EMPTY`.
     """
-    features, seen = np.asarray(map.features), np.asarray(np.asarray(map.count) > 0)  # [rows, cols, slices, C], [rows, cols, slices]
+    features, seen = np.asarray(map.features), np.asarray(map.count) > 0  # [rows, cols, slices, C], [rows, cols, slices]
     if features.ndim != 4 or features.shape[-1] < 3 or seen.shape != features.shape[:3]:
         raise ValueError(f"an unbatched map with colours is needed, got features {features.shape}, count {seen.shape}")
     highest = seen.shape[2] - 1 - np.argmax(seen[..., ::-1], axis=2)
     top = np.take_along_axis(features[..., :3], highest[:, :, None, None], axis=2)[:, :, 0]
-    return from_behind(np.where(seen.any(2)[..., None], to_uint8(top), np.array(EMPTY, np.uint8)))
+    return from_behind(np.where(np.any(seen, axis=2, keepdims=True), to_uint8(top), np.array(EMPTY, np.uint8)))
 
 
 def heatmap_overlay(image: np.ndarray, logits, *, strength: float = 0.85) -> np.ndarray:

@@ -34,10 +34,9 @@ class Match:
 
     pick: jax.Array  # [rows, cols] pick logits
     current: jax.Array  # [R, C, e] unit embeddings of the surface now, times the temperature
-    goal: jax.Array  # [R, C, slices, e] unit embeddings of the goal's voxels
-    seen: jax.Array  # [R, C, slices] bool: the goal's voxel is occupied
     token: jax.Array  # [M, 3] int32 (row, col, slice) of the goal voxels that differ most from the current map
     token_valid: jax.Array  # [M] bool
+    token_embedding: jax.Array  # [M, e] unit embeddings
     token_next: jax.Array  # [M] logits: this voxel's object may be placed next
 
 
@@ -61,7 +60,7 @@ class ResidualBlock(nn.Module):
 
 
 class VoxelEmbedding(nn.Module):
-    """Embed voxels `[R, C, slices, channels]` one by one, the same way in every map and slice, to unit vectors."""
+    """Embed voxels `[..., channels]` one by one, the same way in every map and slice, to unit vectors."""
 
     width: int
     embed: int
@@ -120,7 +119,7 @@ class QueryNet(nn.Module):
     @nn.compact
     def __call__(self, x):
         x = nn.relu(nn.Conv(self.width, (3, 3))(x))
-        x = nn.relu(nn.Conv(self.width, (3, 3), kernel_dilation=(2, 2))(x))
+        x = nn.relu(nn.Conv(self.width, (3, 3))(x))
         return nn.Conv(self.out, (3, 3))(x)
 
 
@@ -144,7 +143,7 @@ class GoalAware(nn.Module):
     spec: types.MapSpec
     rotations: int = 36
     crop: int = 24  # cells, must hold the largest object at any yaw
-    tokens: int = 384
+    tokens: int = 512
     embed: int = 16
     trunk_width: int = 48
     trunk_blocks: int = 3
@@ -157,7 +156,7 @@ class GoalAware(nn.Module):
         self.next_head = nn.Conv(self.spec.slices, (1, 1), kernel_init=nn.initializers.normal(1e-2))
         self.context_head = nn.Conv(16, (1, 1))
         self.pick_in = nn.Conv(self.fine_width, (3, 3))
-        self.pick_mid = nn.Conv(self.fine_width, (3, 3), kernel_dilation=(2, 2))
+        self.pick_mid = nn.Conv(self.fine_width, (3, 3))
         self.pick_out = nn.Conv(1, (1, 1), kernel_init=nn.initializers.normal(1e-2))
         self.key_net = KeyNet(width=self.fine_width, out=self.channels + 1)
         self.query_net = QueryNet(width=16, out=self.channels)
@@ -169,9 +168,7 @@ class GoalAware(nn.Module):
         now_color, now_count = _pool(current)
         goal_color, goal_count = _pool(goal)
         now_seen, goal_seen = now_count > 0, goal_count > 0
-        now_embedding = self.voxel(_voxel_input(now_color, now_count))
-        goal_embedding = self.voxel(_voxel_input(goal_color, goal_count))
-        surface = _highest(now_embedding, now_seen) * self.temperature
+        surface = self.voxel(_highest(_voxel_input(now_color, now_count), now_seen)) * self.temperature
         differs = jnp.linalg.norm(goal_color - now_color, axis=-1) * now_seen
         lacks = (goal_seen & ~now_seen).astype(jnp.float32)
         context = self.trunk(_columns(now_color, now_seen, goal_color, goal_seen, lacks, differs))
@@ -179,11 +176,11 @@ class GoalAware(nn.Module):
         priority = goal_seen * (lacks + differs)
         token, valid = _top_tokens(priority, self.tokens)
         at = (token[:, 0], token[:, 1], token[:, 2])
+        embedding = self.voxel(_voxel_input(goal_color, goal_count)[at])
         token_next = jnp.where(valid, upcoming[at], -1e9)
-        scores = surface @ goal_embedding[at].T + token_next
-        coarse = jax.nn.logsumexp(scores, axis=-1)
+        coarse = jax.nn.logsumexp(surface @ embedding.T + token_next, axis=-1)
         pick = self._pick_fine(current, goal, context) + _upsample(coarse[..., None], POOL)[..., 0]
-        return Match(pick, surface, goal_embedding, goal_seen, token, valid, token_next)
+        return Match(pick, surface, token, valid, embedding, token_next)
 
     def _pick_fine(self, current, goal, context):
         x = _surface_input(current)
@@ -212,8 +209,11 @@ class GoalAware(nn.Module):
         No gradient flows through it: the matching losses teach the embeddings.
         """
         picked = match.current[pick[0] // POOL, pick[1] // POOL]
-        score = jnp.where(match.seen, match.goal @ picked, -1e9)
-        weight = jax.lax.stop_gradient(jnp.exp(score - score.max()))
+        score = jnp.where(match.token_valid, match.token_embedding @ picked, -1e9)
+        share = jax.lax.stop_gradient(jnp.exp(score - score.max()))
+        grid = (self.spec.rows // POOL, self.spec.cols // POOL, self.spec.slices)
+        at = (match.token[:, 0], match.token[:, 1], match.token[:, 2])
+        weight = jnp.zeros(grid).at[at].set(share * match.token_valid)
         fine = jnp.repeat(jnp.repeat(weight, POOL, 0), POOL, 1) * (goal.count > 0)
         height = (jnp.arange(self.spec.slices) + 0.5) * self.spec.slice_height * HEIGHT_SCALE
         return jnp.stack([fine.max(-1), (fine * height).max(-1)], axis=-1)

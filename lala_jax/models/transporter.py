@@ -29,9 +29,7 @@ def normalise(max_height: Float[Array, "rows cols c"]) -> Float[Array, "rows col
     return jnp.concatenate([color, features, height], axis=-1)
 
 
-def pick_crops(
-    maps: Float[Array, "rows cols c"], pick_cell: Int[Array, 2], *, yaw_bins: int, crop: int
-) -> Float[Array, "k crop crop c"]:
+def pick_crops(maps: Float[Array, "rows cols c"], pick_cell: Int[Array, 2], *, yaw_bins: int, crop: int) -> Float[Array, "k crop crop c"]:
     """Cut `yaw_bins` crops about the cell with integer `(row, col)`, crop `b` turned by `+2 pi b / yaw_bins` about world z.
 
     The cell lands on index `crop // 2`, where `correlation.correlate` looks for a kernel's centre.
@@ -120,9 +118,7 @@ class Transporter(nn.Module):
         logits = place_logits(key, query, scale=scale, method=self.method)
         return logits, {"pick_cell": pick_cell, "key": key, "query": query}
 
-    def key(
-        self, current: Float[Array, "rows cols c"], goal: Float[Array, "rows cols c"]
-    ) -> Float[Array, "padded_rows padded_cols d"]:
+    def key(self, current: Float[Array, "rows cols c"], goal: Float[Array, "rows cols c"]) -> Float[Array, "padded_rows padded_cols d"]:
         """Give the key map, `crop // 2` cells larger on each side so that places at the border see whole kernels."""
         rows, cols = current.shape[:2]
         margin = self.crop // 2
@@ -130,9 +126,7 @@ class Transporter(nn.Module):
         key = self.key_net(*(_pad(x, (margin, margin + extra[0]), (margin, margin + extra[1])) for x in (current, goal)))
         return key[: rows + 2 * margin, : cols + 2 * margin]
 
-    def query(
-        self, current: Float[Array, "k crop crop c"], goal: Float[Array, "k crop crop c"]
-    ) -> Float[Array, "k crop crop d"]:
+    def query(self, current: Float[Array, "k crop crop c"], goal: Float[Array, "k crop crop c"]) -> Float[Array, "k crop crop d"]:
         """Give the query kernels of rotated crops of both maps."""
         return self.query_net(current, goal)
 

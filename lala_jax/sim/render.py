@@ -16,16 +16,13 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from mujoco import mjx
 
 from lala_jax import types
-from lala_jax.sim import render_shapes
-from lala_jax.sim import scene
+from lala_jax.sim import render_shapes, render_tiles, scene
 
 SKY = (0.0, 0.0, 0.0)  # RGB where nothing was hit
-SAME = 2e-5  # relative: depths of one surface in the two passes differ by rounding only
-TILE = (32, 32)  # (rows, columns) of pixels cast at a time
+TILE = (24, 24)  # (rows, columns) of pixels cast at a time
 METHODS = ("auto", "tiles", "full")
 
 Layer = types.Views
@@ -44,9 +41,10 @@ def render(
 ) -> types.Views:
     """Render one scene with V cameras (leaves `[V, ...]`), unbatched.
 
-    `geoms` are the geom ids to draw, all by default; `background` is a layer to draw them over. Colour is
-    rgba * (scene.AMBIENT + scene.DIFFUSE * max(0, normal . light)) without shadows; a geom with alpha 0 is not drawn and every other is opaque; a
-    camera inside a geom does not see it; a plane is seen from above only. Raises ValueError on a geom type without a closed form.
+    `geoms` are the geom ids to draw, all by default; `background` is a layer to draw them over. Colour
+    is rgba * (scene.AMBIENT + scene.DIFFUSE * max(0, normal . light)), without shadows. A geom with alpha 0 is not drawn
+    and every other is opaque; a camera inside a geom does not see it; a plane is seen from above only. Raises ValueError
+    on a geom type without a closed form.
     """
     geoms = tuple(range(model.ngeom)) if geoms is None else tuple(int(g) for g in geoms)
     if background is None:
@@ -54,10 +52,9 @@ def render(
     return render_over(background, model, data, camera, geoms=geoms, window=window, method=method)
 
 
-def background(
-    model: mjx.Model, data: mjx.Data, camera: types.Camera, *, geoms: tuple[int, ...], segmentation: bool = True
-) -> Layer:
-    """Render the geoms that never move, once, to draw others over it with `render_over`."""
+@functools.partial(jax.jit, static_argnames=("geoms", "segmentation"))
+def background(model: mjx.Model, data: mjx.Data, camera: types.Camera, *, geoms: tuple[int, ...], segmentation: bool = True) -> Layer:
+    """Render the geoms that never move, once, to draw others over it with `render_over`; jitted, as it is called outside a step."""
     return render(model, data, camera, geoms=geoms, segmentation=segmentation)
 
 
@@ -95,7 +92,7 @@ def render_over(
     groups, ids = _groups(model, geoms)
     if not ids:
         return layer.replace(camera=camera)
-    draw = _drawing(tuple(kind for kind, _ in groups), tuple(window), _pick_method(method))
+    draw = render_tiles.drawing(tuple(kind for kind, _ in groups), tuple(window), _pick_method(method))
     lens = jax.vmap(_lens)(camera)
     jobs = [jax.vmap(functools.partial(_jobs, model, data, kind, ids_), in_axes=(0,))(camera) for kind, ids_ in groups]
     image = {"depth": layer.depth, "rgb": layer.rgb}
@@ -160,7 +157,7 @@ def check_views(views: types.Views, *, min_fraction: float = 0.01) -> None:
             raise ValueError(f"camera {index} has depths that are negative or not finite: is its pose rigid and its focal length positive?")
         fraction = float((seen > 0).mean(axis=(1, 2)).min())
         if fraction < min_fraction:
-            raise ValueError(f"camera {index} sees something in {fraction:.2%} of its pixels, less than {min_fraction:.2%}: where does it look?")
+            raise ValueError(f"camera {index} sees something in {fraction:.2%} of its pixels, not {min_fraction:.2%}: where does it look?")
 
 
 def _check_camera(camera):
@@ -233,119 +230,3 @@ def _pixels(half, centre, cam_from_geom, camera):
     behind = (depth.max() < near) & jnp.isfinite(half).all()
     low, high = jnp.clip(low, 0.0, limit), jnp.where(behind, 0.0, jnp.clip(high, 0.0, limit))
     return jnp.concatenate([low, high]).astype(jnp.int32)
-
-
-@functools.lru_cache
-def _drawing(kinds, tile, method):
-    """Build the function that draws jobs into images, with leading axis N on all; vmap adds its axis to N instead of the loop's body."""
-    body = functools.partial(_draw_tiles if method == "tiles" else _draw_full, kinds, tile)
-
-    @jax.custom_batching.custom_vmap
-    def draw(image, lens, jobs):
-        return body(image, lens, jobs)
-
-    @draw.def_vmap
-    def rule(size, batched, *args):
-        flat = jax.tree.map(lambda leaf, has: leaf if has else jnp.broadcast_to(leaf, (size, *leaf.shape)), args, tuple(batched))
-        flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), flat)
-        out = draw(*flat)
-        out = jax.tree.map(lambda leaf: leaf.reshape(size, -1, *leaf.shape[1:]), out)
-        return out, jax.tree.map(lambda _: True, out)
-
-    return draw
-
-
-def _draw_full(kinds, _, image, lens, jobs):
-    return jax.vmap(functools.partial(_draw_image, kinds))(image, lens, jobs)
-
-
-def _draw_image(kinds, image, lens, jobs):
-    """Cast every geom on every pixel of one image: elementwise all through, one kernel on a GPU."""
-    height, width = image["depth"].shape
-    x, y = _rays(lens, 0, 0, (height, width))
-    depth = jnp.where(image["depth"] > 0, image["depth"], jnp.inf)
-    paint = {name: leaf for name, leaf in image.items() if name != "depth"}
-    for kind, group in zip(kinds, jobs, strict=True):
-        for number in range(group["id"].shape[0]):
-            job = jax.tree.map(lambda leaf: leaf[number], group)  # noqa: B023
-            new, cosine = render_shapes.cast(kind, job["geom"], x, y)
-            wins = (new < depth) & (job["box"][2:] > job["box"][:2]).all()
-            depth = jnp.where(wins, new, depth)
-            paint = {name: _paint(name, wins, cosine, job["rgb"], job["id"], leaf) for name, leaf in paint.items()}
-    return {"depth": jnp.where(jnp.isfinite(depth), depth, 0.0), **paint}
-
-
-def _rays(lens, top, left, shape):
-    x = (jnp.arange(shape[1]) + left + 0.5 - lens[2]) * lens[0]
-    y = (jnp.arange(shape[0]) + top + 0.5 - lens[3]) * lens[1]
-    return x, y
-
-
-def _paint(name, wins, cosine, rgb, index, old):
-    if name == "segmentation":
-        return jnp.where(wins, index, old)
-    return jnp.where(wins[..., None], (scene.AMBIENT + scene.DIFFUSE * cosine)[..., None] * rgb, old)
-
-
-def _draw_tiles(kinds, tile, image, lens, jobs):
-    """Cast every geom on the tiles it projects to: first the depths, then the paint wherever a geom's depth is the final one.
-
-    Two passes because XLA updates a buffer in place only while nothing else in the loop's body reads it.
-    """
-    height, width = image["depth"].shape[1:]
-    tile = min(tile[0], height), min(tile[1], width)
-    tables = [_table(kind, tile, lens, group) for kind, group in zip(kinds, jobs, strict=True)]
-    depth = image["depth"]
-    for table in tables:
-        depth = _over_tiles(table, tile, depth, lambda _, new, old: jnp.where((new < old) | ((old == 0) & jnp.isfinite(new)), new, old))
-    out = {"depth": depth}
-    for name in [name for name in image if name != "depth"]:
-        leaf = image[name]
-        for table in tables:
-            leaf = _over_tiles(table, tile, leaf, functools.partial(_paint_tile, name), depth)
-        out[name] = leaf
-    return out
-
-
-def _table(kind, tile, lens, group):
-    """Flatten the jobs of one type, all images together, to one row of numbers and one of integers a job."""
-    count, geoms = group["id"].shape
-    lenses = jnp.broadcast_to(lens[:, None], (count, geoms, 4))
-    flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), (group["geom"], group["rgb"], lenses))
-    _, restore = ravel_pytree(jax.tree.map(lambda leaf: leaf[0], flat))
-    numbers = jax.vmap(lambda job: ravel_pytree(job)[0])(flat)
-    top, left, bottom, right = jnp.moveaxis(group["box"].reshape(-1, 4), -1, 0)
-    across, down = (right - left + tile[1] - 1) // tile[1], (bottom - top + tile[0] - 1) // tile[0]
-    images = jnp.repeat(jnp.arange(count), geoms)
-    integers = [images, group["id"].reshape(-1), top, left, jnp.maximum(across, 1), jnp.maximum(across, 0) * jnp.maximum(down, 0)]
-    return kind, restore, numbers, jnp.stack([leaf.astype(jnp.int32) for leaf in integers], axis=1)
-
-
-def _paint_tile(name, job, new, old, cosine, final):
-    wins = new <= final * (1 + SAME)
-    return _paint(name, wins, cosine, job["rgb"], job["id"], old)
-
-
-def _over_tiles(table, tile, buffer, update, final=None):
-    """Update `buffer` in place, tile by tile, geom by geom."""
-    kind, restore, numbers, integers = table
-    height, width = buffer.shape[1:3]
-
-    def draw_geom(number, buffer):
-        row, (image, index, top, left, across, tiles) = numbers[number], integers[number]
-
-        def draw_tile(at, buffer):
-            geom, rgb, lens = restore(row)
-            start = image, jnp.minimum(top + at // across * tile[0], height - tile[0]), jnp.minimum(left + at % across * tile[1], width - tile[1])
-            depth, cosine = render_shapes.cast(kind, geom, *_rays(lens, start[1], start[2], tile))
-            tail = buffer.shape[3:]
-            old = jax.lax.dynamic_slice(buffer, start + (0,) * len(tail), (1, *tile, *tail))[0]
-            if final is None:
-                new = update(None, depth, old)
-            else:
-                new = update({"rgb": rgb, "id": index}, depth, old, cosine, jax.lax.dynamic_slice(final, start, (1, *tile))[0])
-            return jax.lax.dynamic_update_slice(buffer, new[None], start + (0,) * len(tail))
-
-        return jax.lax.fori_loop(0, tiles, draw_tile, buffer)
-
-    return jax.lax.fori_loop(0, numbers.shape[0], draw_geom, buffer)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lala_jax.models import streams, transporter
+from lala_jax.models import transporter
 
 SMALL = {"yaw_bins": 4, "crop": 8, "width": 8, "stages": 2}
 
@@ -22,9 +22,7 @@ def _built(rows=12, cols=8, **options):
     return net, jax.jit(net.init)(jax.random.key(1), current, goal), current, goal
 
 
-@pytest.mark.parametrize(
-    "variant, parameters", [("single", 29_466_832), ("two_stream", 58_933_706), ("two_stream_lateral", 59_451_146)]
-)
+@pytest.mark.parametrize("variant, parameters", [("single", 29_466_832), ("two_stream", 58_933_706), ("two_stream_lateral", 59_451_146)])
 def test_paper_size(variant, parameters):
     """Three networks of one, two, and two hourglasses of 9.82 M parameters."""
     net = transporter.Transporter(variant)
@@ -37,16 +35,16 @@ def test_paper_size(variant, parameters):
     assert intermediates["key"].shape == (384, 224, 3) and intermediates["query"].shape == (36, 64, 64, 3)
 
 
-@pytest.mark.parametrize("variant", streams.VARIANTS)
-def test_every_variant_runs_learns_and_starts_near_zero(variant):
-    net, params, current, goal = _built(variant=variant)
+@pytest.mark.parametrize("variant", ["single", "two_stream_lateral"])  # the latter holds every part of two_stream
+def test_learns_everywhere_and_starts_near_zero(variant):
+    net, params, current, goal = _built(variant=variant, stages=2 if variant == "two_stream_lateral" else 1)
 
-    def loss(params):
+    def loss(params, current, goal):
         logits, _ = net.apply(params, current, goal, jnp.array([3, 5]))
         chosen = logits["pick"][3, 5] + logits["place"][1, 7, 2]
         return sum(jax.nn.logsumexp(x) for x in logits.values()) - chosen, logits
 
-    grads, logits = jax.jit(jax.grad(loss, has_aux=True))(params)
+    grads, logits = jax.jit(jax.grad(loss, has_aux=True))(params, current, goal)
     for name, cells in (("pick", 12 * 8), ("place", 4 * 12 * 8)):
         assert logits[name].size == cells and logits[name].dtype == jnp.float32
         assert jax.nn.logsumexp(logits[name]) - logits[name].max() > 0.3 * math.log(cells)
@@ -55,7 +53,7 @@ def test_every_variant_runs_learns_and_starts_near_zero(variant):
 
 
 def test_the_best_pick_is_taken_where_none_is_given():
-    net, params, current, goal = _built()
+    net, params, current, goal = _built(variant="single", stages=1)
     apply = jax.jit(net.apply)
     logits, intermediates = apply(params, current, goal)
     best = np.unravel_index(np.argmax(logits["pick"]), (12, 8))
@@ -75,7 +73,7 @@ def test_jit_equals_eager_and_vmap_equals_a_loop():
 
 def test_maps_of_any_size_keep_their_cells():
     """Sides that the strides do not divide are padded and cut: a map with a border of zeros spelled out scores the same."""
-    net, params, current, goal = _built(rows=11, cols=7)
+    net, params, current, goal = _built(rows=11, cols=7, variant="single")
     logits, intermediates = jax.jit(net.apply)(params, current, goal, jnp.array([4, 4]))
     assert logits["pick"].shape == (11, 7) and logits["place"].shape == (4, 11, 7)
     assert intermediates["key"].shape == (19, 15, 3)
@@ -83,9 +81,9 @@ def test_maps_of_any_size_keep_their_cells():
     def pad(x, top, bottom, left, right):
         return jnp.pad(x, ((top, bottom), (left, right), (0, 0)))
 
-    pick = jax.jit(lambda *maps: net.bind(params).pick_net(*maps))(*(pad(x, 0, 1, 2, 3) for x in (current, goal)))
+    pick = jax.jit(lambda params, *maps: net.bind(params).pick_net(*maps))(params, *(pad(x, 0, 1, 2, 3) for x in (current, goal)))
     np.testing.assert_allclose(logits["pick"], pick[:11, 2:9, 0], atol=1e-5)
-    key = jax.jit(lambda *maps: net.bind(params).key_net(*maps))(*(pad(x, 4, 5, 4, 5) for x in (current, goal)))
+    key = jax.jit(lambda params, *maps: net.bind(params).key_net(*maps))(params, *(pad(x, 4, 5, 4, 5) for x in (current, goal)))
     np.testing.assert_allclose(intermediates["key"], key[:19, :15], atol=1e-5)
 
 
@@ -94,13 +92,13 @@ def test_maps_of_any_size_keep_their_cells():
 def test_a_held_pattern_scores_best_where_it_was_pasted(crop, turn, row, col):
     """Whatever is under the pick, turned and pasted about a cell, is found at that cell and turn: no half cell is lost."""
     rng = np.random.default_rng(turn)
-    scene, pick = rng.normal(size=(20, 16, 3)).astype(np.float32), jnp.array([7, 6])
+    scene, pick = jnp.asarray(rng.normal(size=(20, 16, 3)), jnp.float32), jnp.array([7, 6])
     crops = transporter.pick_crops(scene, pick, yaw_bins=6, crop=crop)
     margin = crop // 2
     key = np.zeros((20 + 2 * margin, 16 + 2 * margin, 3), np.float32)
     key[row : row + crop, col : col + crop] = crops[turn]  # index crop // 2 of the crop falls on cell (row, col)
     norms = jnp.linalg.norm(crops.reshape(6, -1), axis=-1)[:, None, None, None]
-    scores = transporter.place_logits(key, crops / norms, scale=0.5)
+    scores = transporter.place_logits(jnp.asarray(key), crops / norms, scale=0.5)
     assert scores.shape == (6, 20, 16)
     assert np.unravel_index(np.argmax(scores), scores.shape) == (turn, row, col)
     np.testing.assert_allclose(scores[turn, row, col], 0.5 * norms[turn].squeeze(), rtol=1e-4)
@@ -108,12 +106,10 @@ def test_a_held_pattern_scores_best_where_it_was_pasted(crop, turn, row, col):
 
 def test_turning_the_scene_by_one_bin_turns_the_place_map_by_one_bin():
     """A quarter turn moves cells onto cells, so crop b of the turned map is crop b + 1 of the map, and places shift by a bin."""
-    maps = np.random.default_rng(0).normal(size=(15, 15, 2)).astype(np.float32)
-    turned = np.swapaxes(maps[::-1], 0, 1)  # (row, col) goes to (col, -row): +x to +y
+    maps = jax.random.normal(jax.random.key(0), (15, 15, 2))
+    turned = jnp.swapaxes(maps[::-1], 0, 1)  # (row, col) goes to (col, -row): +x to +y
     crops = transporter.pick_crops(maps, jnp.array([7, 7]), yaw_bins=4, crop=9)
-    np.testing.assert_allclose(
-        transporter.pick_crops(turned, jnp.array([7, 7]), yaw_bins=4, crop=9), np.roll(crops, -1, axis=0), atol=1e-5
-    )
+    np.testing.assert_allclose(transporter.pick_crops(turned, jnp.array([7, 7]), yaw_bins=4, crop=9), np.roll(crops, -1, axis=0), atol=1e-5)
 
     def scores(goal):
         return np.asarray(transporter.place_logits(jnp.pad(goal, ((4, 4), (4, 4), (0, 0))), crops, scale=1.0))
@@ -127,7 +123,7 @@ def test_normalising_undoes_the_statistics_and_passes_features():
     plain = rng.normal(size=(3, 2, 6)).astype(np.float32)
     seen = plain * np.array([transporter.COLOR_STD] * 3 + [1, 1, transporter.HEIGHT_STD], np.float32)
     seen += np.array([transporter.COLOR_MEAN] * 3 + [0, 0, transporter.HEIGHT_MEAN], np.float32)
-    np.testing.assert_allclose(transporter.normalise(seen), plain, atol=1e-5)
+    np.testing.assert_allclose(transporter.normalise(jnp.asarray(seen)), plain, atol=1e-5)
 
 
 @pytest.mark.parametrize(
