@@ -1,72 +1,14 @@
-"""Record the oracle's demonstrations: `python -m lala_jax.collect --config=configs/tower.py --workdir=runs/tower`."""
+"""Record the oracle's demonstrations: `python -m lala_jax.collect --config=configs/tower.py --config.data.demos=500`."""
 
 from __future__ import annotations
 
-import pathlib
-from collections.abc import Mapping
-from typing import Any
-
-import numpy as np
-from rich import progress
-
-from lala_jax import build, dataset, options, rollout
-from lala_jax.sim.tasks import base
-
-SHARD = 10  # demonstrations written at a time
-MIN_SCORE = 99.0  # a demonstration below is not kept
-
-
-def collect(config: Mapping[str, Any], *, quiet: bool = False) -> pathlib.Path:
-    """Complete the dataset of the config to `data.demos` demonstrations of train seeds and give its directory.
-
-    Goes on where an earlier run stopped; a directory that has enough is left alone. Raises `dataset.DatasetError` where the
-    directory holds another task, `options.OptionsError` where the train split runs out of seeds.
-    """
-    task, wanted = build.task(config), config["data"]["demos"]
-    directory = pathlib.Path(config["data"]["directory"])
-    identity = {"task": task.name, "task_options": build.task_options(config)}
-    done = dataset.seeds(directory)
-    if done.size:
-        dataset.load(directory, count=1, **identity)  # refuses another task before anything is written
-    kept, place = len(done), (int(done.max()) // 2 + 1 if done.size else 0)
-    if kept >= wanted:
-        return directory
-    columns = (*progress.Progress.get_default_columns(), progress.MofNCompleteColumn())
-    with progress.Progress(*columns, disable=quiet) as bar:
-        shown = bar.add_task(f"demonstrations of {task.name}", total=wanted, completed=kept)
-        while kept < wanted:
-            seeds = build.split_seeds("train", place, min(SHARD, wanted - kept))
-            place += len(seeds)
-            demos = demonstrate(task, seeds, threads=config["data"]["threads"])
-            if demos:
-                dataset.append(directory, demos, **identity)
-            kept += len(demos)
-            bar.update(shown, completed=kept)
-    return directory
-
-
-def demonstrate(task: base.Task, seeds: list[int], *, threads: int) -> list:
-    """Let the oracle solve the scenes of `seeds` and give the demonstrations that reached the goal.
-
-    Seeds whose scene has no free pose are passed over.
-    """
-    scenes, usable = [], []
-    for seed in seeds:
-        try:
-            scenes.append(task.sample(seed))
-        except base.NoFreePose:
-            continue
-        usable.append(seed)
-    if not usable:
-        return []
-    episodes = rollout.run(task, scenes, usable, rollout.oracle_agent(task, scenes, usable), threads=threads)
-    return [episode.demo() for episode in episodes if episode.score > MIN_SCORE and np.isfinite(episode.poses).all()]
+from lala_jax import dataset, options, recording
 
 
 def main(config, workdir) -> None:
     """Collect and say where."""
     del workdir
-    print(f"demonstrations are in {collect(config)}")
+    print(f"demonstrations are in {recording.collect(config)}")
 
 
 if __name__ == "__main__":

@@ -132,9 +132,7 @@ class GoalAwarePolicy:
         key_draw, key_match, key_refine = jax.random.split(key, 3)
         variables, model, spec = {"params": params}, self.model, self.spec
         candidates = state.ready if not self.multi_action else ~state.placed
-        sample = draw(
-            key_draw, state, spec=spec, rotations=model.rotations, candidates=candidates, multi_action=self.multi_action
-        )
+        sample = draw(key_draw, state, spec=spec, rotations=model.rotations, candidates=candidates, multi_action=self.multi_action)
         match = model.apply(variables, current, goal, method="match")
         place = model.apply(variables, current, goal, match, sample.pick, method="place")
         terms = {
@@ -235,9 +233,7 @@ class TransporterPolicy:
     def loss(self, params, key: jax.Array, state: types.State, current: types.TopDownMap, goal: types.TopDownMap):
         """Give `(loss, metrics)` of one example: cross-entropy of pick and place (eqs. 4-6)."""
         rotations = self.model.yaw_bins
-        sample = draw(
-            key, state, spec=self.spec, rotations=rotations, candidates=state.ready, multi_action=self.multi_action
-        )
+        sample = draw(key, state, spec=self.spec, rotations=rotations, candidates=state.ready, multi_action=self.multi_action)
         logits, _ = self.model.apply({"params": params}, self._input(current), self._input(goal), sample.pick)
         pick = losses.masked_cross_entropy(logits["pick"], sample.pick_valid & sample.drawn)
         place = losses.place_cross_entropy(logits["place"], sample.bins, sample.cells, sample.valid)

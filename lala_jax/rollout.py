@@ -96,9 +96,7 @@ def _record(task, episode, poses) -> None:
     episode.ready.append(oracle.ready(task, episode.scene, poses))
 
 
-def cause(
-    scene: types.Scene, ready: np.ndarray, before: np.ndarray, after: np.ndarray, poses: np.ndarray, outcome: physics.Outcome
-) -> str:
+def cause(scene: types.Scene, ready: np.ndarray, before: np.ndarray, after: np.ndarray, poses: np.ndarray, outcome: physics.Outcome) -> str:
     """Say how one action went, one of CAUSES; `ready`, `before` (placed), `after` are `[N]` bool."""
     index = outcome.object
     if index < 0:

@@ -16,10 +16,10 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
-from mujoco import mjx
 
 from lala_jax import types
 from lala_jax.sim import render_shapes, render_tiles, scene
+from lala_jax.sim.quiet import mjx
 
 SKY = (0.0, 0.0, 0.0)  # RGB where nothing was hit
 TILE = (24, 24)  # (rows, columns) of pixels cast at a time

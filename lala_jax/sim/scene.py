@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
-import io
 from typing import TYPE_CHECKING
 
 import jax
@@ -145,8 +143,7 @@ def static_geoms(model: mujoco.MjModel | mjx.Model) -> tuple[int, ...]:
 @functools.cache
 def geom_template(task: base.Task) -> tuple[mjx.Model, mjx.Data]:
     """Give a task's MJX model and data with the arm at home, as a canvas for `place`; for looking at only, it has no contacts."""
-    with contextlib.redirect_stdout(io.StringIO()):  # says on import that Warp is missing
-        from mujoco import mjx
+    from lala_jax.sim.quiet import mjx  # slow to import, and only the renderer's side needs it
 
     model = build_model(task, task.sample(0))
     model.geom_contype[:] = 0

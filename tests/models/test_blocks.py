@@ -76,7 +76,7 @@ def _conv(x, kernel, stride=1):
 def test_a_block_is_its_formula(stride, project, last_relu):
     block = blocks.ResidualBlock(3, 5, stride, project, last_relu)
     x = jax.random.normal(jax.random.key(0), (6, 4, 5))
-    params = jax.jit(block.init)(jax.random.key(1), x)
+    params = jax.jit(block.init)(jax.random.key(1, impl="rbg"), x)
     kernels = {name: np.asarray(leaf["kernel"], np.float64) for name, leaf in params["params"].items()}
     image = np.asarray(x, np.float64)
     y = np.maximum(_conv(image, kernels["reduce"]), 0)
@@ -97,7 +97,7 @@ def test_upsampling_interpolates_between_the_cells_that_strides_take():
 def test_a_compact_one_keeps_the_image_and_any_batch(stages):
     net = blocks.ResNet43_8s(2, width=4, stages=stages)
     x = jax.random.normal(jax.random.key(0), (2, 3, 8, 12, 3))
-    params = jax.jit(net.init)(jax.random.key(1), x[0, 0])
+    params = jax.jit(net.init)(jax.random.key(1, impl="rbg"), x[0, 0])
     output, decoded = jax.jit(net.apply)(params, x)
     assert output.shape == (2, 3, 8, 12, 2) and len(decoded) == stages - 1
     one, _ = jax.jit(net.apply)(params, x[1, 2])
@@ -108,7 +108,7 @@ def test_laterals_enter_the_decoder():
     net = blocks.ResNet43_8s(1, width=4, stages=2)
     x = jax.random.normal(jax.random.key(0), (8, 8, 3))
     lateral = [jax.random.normal(jax.random.key(1), (8, 8, 4))]
-    params = jax.jit(net.init)(jax.random.key(2), x, lateral)
+    params = jax.jit(net.init)(jax.random.key(2, impl="rbg"), x, lateral)
     assert _count(params) - _count(_abstract(net, 8, 8, 3)[0]) == 8 * 4 + 4
     apply = jax.jit(net.apply)
     assert not np.allclose(apply(params, x, lateral)[0], apply(params, x, [-lateral[0]])[0])
@@ -122,7 +122,7 @@ def test_an_output_of_one_channel_is_never_dead():
         net = blocks.ResNet43_8s(1, width=8, stages=1, head_relu=head_relu)
         return net.init_with_output(key, x)[0][0].std()
 
-    keys = jax.random.split(jax.random.key(1), 32)
+    keys = jax.random.split(jax.random.key(1, impl="rbg"), 32)
     spreads = {relu: jax.jit(lambda keys, relu=relu: jax.lax.map(lambda key: spread(key, relu), keys))(keys) for relu in (False, True)}
     assert (spreads[False] > 1e-3).all()
     assert not (spreads[True] > 1e-3).all()

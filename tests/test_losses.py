@@ -1,0 +1,122 @@
+"""Labels and losses against slow numpy loops and the poses they come from."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lala_jax import losses, types
+from lala_jax.perception import transforms
+from lala_jax.sim import tasks
+
+SPEC = types.MapSpec(cell=0.0125)
+
+
+def state_of(name="pallet", seed=3):
+    """A scene at its start as a training state, nothing placed."""
+    scene = tasks.get(name).sample(seed)
+    nothing = np.zeros(len(scene.size), bool)
+    fields = {field: getattr(scene, field) for field in ("size", "color", "base", "goal", "symmetry")}
+    return types.State(**fields, poses=scene.start, placed=nothing, ready=~nothing)
+
+
+def on_device(state):
+    """The same state with JAX leaves, as training has it."""
+    return jax.tree.map(jnp.asarray, state)
+
+
+def top_owner(state, xy):
+    """The object whose top face is highest over a point, and how far inside the face the point is; slow and obvious."""
+    best = (-np.inf, -1, 0.0)
+    for index, (pose, size) in enumerate(zip(state.poses, state.size, strict=True)):
+        local = transforms.apply_pose(transforms.pose_inverse(np.asarray(pose, float)), np.array([*xy, pose[2]]))
+        inside = float((np.asarray(size[:2]) / 2 - np.abs(local[:2])).min())
+        if inside > 0:
+            best = max(best, (float(pose[2] + size[2] / 2), index, inside))
+    return best[1:]
+
+
+@pytest.mark.parametrize("name", ["tower", "pallet"])
+def test_pick_valid_equals_loop(name):
+    state = state_of(name)
+    valid = np.asarray(losses.pick_valid(on_device(state), spec=SPEC))
+    for row in range(SPEC.rows):
+        for col in range(SPEC.cols):
+            xy = np.asarray(types.world_from_index(SPEC, np.array([row, col])))
+            index, inside = top_owner(state, xy)
+            expected = np.zeros(len(state.size), bool)
+            if index >= 0 and inside > losses.PICK_MARGIN:
+                expected[index] = True
+            if abs(inside - losses.PICK_MARGIN) > 1e-5:
+                assert (valid[:, row, col] == expected).all(), (row, col)
+    assert valid.any((1, 2)).all()
+
+
+@pytest.mark.parametrize("name", ["tower", "pallet"])
+def test_place_label_brings_the_object_to_its_goal(name):
+    """Turning by the label's yaw about the pick and moving it to the label's xy ends at the goal pose, or its symmetric twin."""
+    state = state_of(name, seed=5)
+    for index in range(len(state.size)):
+        pick = state.poses[index, :2] + np.array([0.007, -0.004], np.float32)
+        label = losses.place_label(on_device(state), jnp.int32(index), jnp.asarray(pick))
+        assert int(label.valid.sum()) == round(2 * math.pi / float(state.symmetry[index]))
+        for xy, yaw, valid in zip(*map(np.asarray, (label.xy, label.yaw, label.valid)), strict=True):
+            if not valid:
+                continue
+            cos, sin = np.cos(yaw), np.sin(yaw)
+            moved = xy + np.array([[cos, -sin], [sin, cos]]) @ (state.poses[index, :2] - pick)
+            np.testing.assert_allclose(moved, state.goal[index, :2], atol=1e-5)
+            off = transforms.yaw_from_quat(state.poses[index, 3:]) + yaw - transforms.yaw_from_quat(state.goal[index, 3:])
+            assert abs(float(transforms.wrap_angle(off, float(state.symmetry[index])))) < 1e-4
+
+
+def test_place_index_masks_what_leaves_the_map():
+    state = state_of()
+    label = losses.place_label(on_device(state), jnp.int32(0), jnp.asarray(state.poses[0, :2]))
+    bins, cells, valid = losses.place_index(label, spec=SPEC, rotations=36)
+    assert (np.asarray(valid) == np.asarray(label.valid)).all()
+    assert (np.abs(np.asarray(types.world_from_index(SPEC, cells)) - np.asarray(label.xy)) <= SPEC.cell / 2 + 1e-6).all()
+    off = np.asarray(label.yaw) - np.asarray(bins) * 2 * math.pi / 36
+    assert (np.abs(transforms.wrap_angle(off)) <= math.pi / 36 + 1e-5).all()
+    outside = label.replace(xy=label.xy + 2.0)
+    assert not np.asarray(losses.place_index(outside, spec=SPEC, rotations=36)[2]).any()
+
+
+@pytest.mark.parametrize("how", [lambda f: f, jax.jit])
+def test_masked_cross_entropy_equals_numpy(how):
+    rng = np.random.default_rng(0)
+    logits, valid = rng.normal(size=(7, 5)).astype(np.float32) * 4, rng.random((7, 5)) < 0.3
+    probability = np.exp(logits.astype(float)) / np.exp(logits.astype(float)).sum()
+    loss = how(losses.masked_cross_entropy)(jnp.asarray(logits), jnp.asarray(valid))
+    np.testing.assert_allclose(loss, -np.log(probability[valid].sum()), rtol=1e-5)
+    assert how(losses.masked_cross_entropy)(jnp.asarray(logits), jnp.zeros_like(valid)) == 0
+
+
+def test_place_cross_entropy_equals_masked():
+    rng = np.random.default_rng(1)
+    logits = rng.normal(size=(6, 9, 8)).astype(np.float32)
+    bins, cells = np.array([1, 4, 2, 0]), np.array([[3, 2], [8, 7], [0, 0], [5, 5]])
+    valid = np.array([True, True, False, False])
+    mask = np.zeros(logits.shape, bool)
+    mask[1, 3, 2] = mask[4, 8, 7] = True
+    loss = losses.place_cross_entropy(jnp.asarray(logits), jnp.asarray(bins), jnp.asarray(cells), jnp.asarray(valid))
+    np.testing.assert_allclose(loss, losses.masked_cross_entropy(jnp.asarray(logits), jnp.asarray(mask)), rtol=1e-5)
+
+
+def test_owner_finds_the_box_a_point_is_in():
+    scene = tasks.get("pallet").sample(2)
+    rng = np.random.default_rng(0)
+    local = rng.uniform(-0.45, 0.45, (8, 20, 3)) * scene.size[:, None]
+    points = transforms.apply_pose(scene.goal[:, None].astype(float), local)
+    whose = losses.owner(jnp.asarray(points.reshape(-1, 3), jnp.float32), poses=scene.goal, size=scene.size, tolerance=0.005)
+    assert (np.asarray(whose).reshape(8, 20) == np.arange(8)[:, None]).all()
+    far = jnp.array([[0.3, -0.4, 0.2]])
+    assert int(losses.owner(far, poses=scene.goal, size=scene.size, tolerance=0.005)[0]) == -1
+
+
+def test_huber_is_quadratic_then_linear():
+    error = np.linspace(-3, 3, 61).astype(np.float32)
+    expected = np.where(np.abs(error) < 1, error**2 / 2, np.abs(error) - 0.5)
+    np.testing.assert_allclose(losses.huber(jnp.asarray(error)), expected, atol=1e-6)

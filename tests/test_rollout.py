@@ -1,0 +1,94 @@
+"""Closed loop with the real primitive: the oracle solves, the blind agent does not, failures are counted and named."""
+
+import numpy as np
+import pytest
+
+from lala_jax import recording, rollout, types
+from lala_jax.sim import tasks
+
+
+def run(task, seeds, agent=None, **options):
+    scenes = [task.sample(seed) for seed in seeds]
+    agent = agent or rollout.oracle_agent(task, scenes, seeds)
+    return rollout.run(task, scenes, seeds, agent, threads=2, **options)
+
+
+@pytest.mark.parametrize(("name", "objects"), [("tower", 3), ("pallet", 8)])
+def test_oracle_scores_100(name, objects):
+    task = tasks.get(name, num_objects=objects)
+    episodes = run(task, [0, 2])
+    summed = rollout.summary(episodes)
+    assert summed["score"] == 100 and summed["complete_percent"] == 100
+    assert summed["actions"] == 2 * objects == summed["actions_by_cause"]["right"]
+    for episode in episodes:
+        assert len(episode.poses) == len(episode.actions) + 1
+        assert episode.ready[0].any() and not episode.ready[-1].any()
+
+
+def test_demo_is_the_episode():
+    task = tasks.get("tower", num_objects=2)
+    episode = run(task, [4])[0]
+    demo = episode.demo()
+    assert demo.poses.shape == (3, 2, 7) and demo.placed[-1].all() and demo.score == 100
+    np.testing.assert_array_equal(demo.poses[0], np.asarray(episode.poses[0], np.float32))
+    np.testing.assert_allclose(demo.action.place[:, 2] > 0, True)
+
+
+def test_threads_change_nothing():
+    task = tasks.get("tower", num_objects=2)
+    one, two = (recording.demonstrate(task, [0, 2, 4], threads=threads) for threads in (1, 2))
+    for a, b in zip(one, two, strict=True):
+        np.testing.assert_array_equal(a.poses, b.poses)
+
+
+def constant(action):
+    return lambda indices, poses: [action for _ in indices]
+
+
+@pytest.mark.parametrize(
+    ("pick", "reason"),
+    [((0.3, 0.45, 0.0), "nothing under the tip"), ((1.4, 0.0, 0.0), "out of the workspace")],
+)
+def test_a_failing_pick_is_counted(pick, reason):
+    task = tasks.get("tower", num_objects=1)
+    scene = task.sample(0)
+    assert np.linalg.norm(scene.start[0, :2] - np.array(pick[:2])) > 0.06
+    action = types.PickPlace(pick=np.array(pick, np.float32), place=np.array([0.5, 0.0, 0.0], np.float32), yaw=np.float32(0))
+    summed = rollout.summary(run(task, [0], constant(action), max_actions=2))
+    assert summed["score"] == 0 and summed["actions_by_cause"]["missed pick"] == 2
+    assert summed["failures_by_reason"] == {reason: 2}
+
+
+def test_giving_up_ends_the_episode():
+    task = tasks.get("tower", num_objects=2)
+    episode = run(task, [0], constant(None))[0]
+    assert not episode.actions and episode.score == 0
+
+
+def test_causes_are_told_apart():
+    scene = tasks.get("tower", num_objects=2).sample(0)
+    from lala_jax.sim import physics
+
+    def cause(index=0, held=True, ready=(True, False), before=(False, False), after=(False, False), shift=0.0):
+        poses = np.array(scene.goal, float)
+        poses[:, 0] += shift
+        outcome = physics.Outcome(object=index, held_to_place=held, reason="ok", seconds=1.0)
+        return rollout.cause(scene, *(np.array(value) for value in (ready, before, after)), poses, outcome)
+
+    assert cause(index=-1) == "missed pick"
+    assert cause(held=False) == "lost on the way"
+    assert cause(after=(True, False)) == "right"
+    assert cause(index=1) == "wrong object"
+    assert cause(before=(True, False)) == "knocked over"
+    assert cause(shift=0.03) == "wrong place"
+    assert cause(shift=0.0) == "wrong height"
+
+
+def test_interval_is_the_normal_one():
+    task = tasks.get("tower", num_objects=1)
+    episodes = run(task, [0, 2, 4], constant(None))
+    for episode, placed in zip(episodes, (True, False, False), strict=True):
+        episode.placed[-1] = np.array([placed])
+    summed = rollout.summary(episodes)
+    half = 1.96 * np.std([100, 0, 0], ddof=1) / np.sqrt(3)
+    np.testing.assert_allclose(summed["interval95"], [0.0, min(100, 100 / 3 + half)])
