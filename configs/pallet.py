@@ -13,4 +13,8 @@ from lala_jax import defaults
 
 def get_config(arg=""):
     """Give the config; `arg` is "", "smoke" or "paper"."""
-    return defaults.get(arg, task="pallet")
+    config = defaults.get(arg, task="pallet")
+    if arg == "":
+        config.train.steps = 1200
+        config.train.eval_every = 600
+    return config

@@ -13,4 +13,8 @@ from lala_jax import defaults
 
 def get_config(arg=""):
     """Give the config; `arg` is "", "smoke" or "paper"."""
-    return defaults.get(arg, task="tower")
+    config = defaults.get(arg, task="tower")
+    if arg == "":
+        config.train.steps = 800
+        config.train.eval_every = 400
+    return config

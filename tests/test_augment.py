@@ -37,9 +37,9 @@ def test_recolor_keeps_colours_apart_and_in_range():
 def test_rigid_moves_everything_by_one_motion(name):
     """The base, the objects and the goal move together: every relative pose stays, and all stay on the map."""
     state = state_of(name)
-    moved_some = False
+    moved_some, motion = False, jax.jit(augment.rigid, static_argnames=("spec", "base_radius"))
     for seed in range(12):
-        new = jax.jit(augment.rigid, static_argnames=("spec", "base_radius"))(jax.random.key(seed), on_device(state), spec=SPEC, base_radius=0.04)
+        new = motion(jax.random.key(seed), on_device(state), spec=SPEC, base_radius=0.04)
         for field in ("poses", "goal"):
             before = transforms.pose_multiply(transforms.pose_inverse(state.base.astype(float)), getattr(state, field).astype(float))
             after = transforms.pose_multiply(transforms.pose_inverse(np.asarray(new.base, float)), np.asarray(getattr(new, field), float))
@@ -58,7 +58,9 @@ def test_rigid_motion_carries_the_labels():
     local = np.array([0.01, -0.005, 0.0])
     for index in range(3):
         picks = [transforms.apply_pose(np.asarray(s.poses[index], float), local)[:2] for s in (state, new)]
-        labels = [losses.place_label(on_device(s), index, jnp.asarray(pick, jnp.float32)) for s, pick in zip((state, new), picks, strict=True)]
+        labels = [
+            losses.place_label(on_device(s), index, jnp.asarray(pick, jnp.float32)) for s, pick in zip((state, new), picks, strict=True)
+        ]
         world = transforms.pose_multiply(np.asarray(new.base, float), transforms.pose_inverse(state.base.astype(float)))
         old = np.concatenate([np.asarray(labels[0].xy), np.zeros((4, 1))], axis=-1)
         np.testing.assert_allclose(transforms.apply_pose(world, old)[:, :2], labels[1].xy, atol=1e-5)

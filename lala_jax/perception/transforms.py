@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -15,15 +16,18 @@ import numpy as np
 from jaxtyping import Array, Num
 
 # Shapes of the arguments, numpy or jax or nested sequences of numbers; results are arrays of the same shapes.
-_Any = Array | np.ndarray
-Angles = Num[_Any, "..."] | float | Sequence
-Vectors = Num[_Any, "... 3"] | Sequence
-Points2 = Num[_Any, "... 2"] | Sequence
-Motions = Num[_Any, "... 3"] | Sequence
-Quats = Num[_Any, "... 4"] | Sequence
-Poses = Num[_Any, "... 7"] | Sequence
-Rotations = Num[_Any, "... 3 3"] | Sequence
-Matrices = Num[_Any, "... 4 4"] | Sequence
+if TYPE_CHECKING:  # a static checker cannot do arithmetic with these unions; pytest checks them for real
+    Angles = Vectors = Points2 = Motions = Quats = Poses = Rotations = Matrices = Any
+else:
+    _Any = Array | np.ndarray | np.generic
+    Angles = Num[_Any, "..."] | float | Sequence
+    Vectors = Num[_Any, "... 3"] | Sequence
+    Points2 = Num[_Any, "... 2"] | Sequence
+    Motions = Num[_Any, "... 3"] | Sequence
+    Quats = Num[_Any, "... 4"] | Sequence
+    Poses = Num[_Any, "... 7"] | Sequence
+    Rotations = Num[_Any, "... 3 3"] | Sequence
+    Matrices = Num[_Any, "... 4 4"] | Sequence
 
 
 def to_arrays(*values):
