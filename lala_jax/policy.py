@@ -193,7 +193,7 @@ class GoalAwarePolicy:
         yaw = sample.place.yaw[which] * (model.rotations / (2 * math.pi)) - turn
         yaw = jnp.mod(yaw + model.rotations / 2, model.rotations) - model.rotations / 2
         target = jnp.append(target, yaw)
-        guess = model.apply(variables, place, jnp.mod(turn, model.rotations), cell, method="refine")
+        guess = jnp.asarray(model.apply(variables, place, jnp.mod(turn, model.rotations), cell, method="refine"))
         use = sample.valid.any()
         error = jnp.linalg.norm(guess[:2] - target[:2]) * spec.cell
         return jnp.where(use, losses.huber(guess - target).sum(), 0.0), jnp.where(use, error, jnp.nan)

@@ -46,9 +46,9 @@ def augmented(recipe: Recipe, key: jax.Array, example: types.State) -> types.Sta
 def observations(recipe: Recipe, key: jax.Array, examples: types.State) -> tuple[types.TopDownMap, types.TopDownMap]:
     """Render and fuse B examples and their goals: maps with leaves `[B, ...]`."""
     size = examples.color.shape[0]
-    both = jax.tree.map(lambda x: jnp.concatenate([x, x]), (examples.size, examples.color, examples.base))
+    facts, color, stand = (jnp.concatenate([x, x]) for x in (examples.size, examples.color, examples.base))
     poses = jnp.concatenate([examples.poses, examples.goal])
-    maps = recipe.observer.maps(*both, poses, key=key)
+    maps = recipe.observer.maps(facts, color, stand, poses, key=key)
     return jax.tree.map(lambda x: x[:size], maps), jax.tree.map(lambda x: x[size:], maps)
 
 

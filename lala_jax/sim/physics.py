@@ -30,10 +30,7 @@ REASONS = (
 APPROACH = 0.32  # metres above the pick and the place, where the arm can reach that far
 MIN_APPROACH = 0.08  # metres: a point that cannot be approached from here is out of reach
 _APPROACHES = tuple(np.arange(APPROACH, MIN_APPROACH - 1e-9, -0.02))
-_TIMESTEP = 0.004  # seconds
 _TICK_STEPS = 2  # simulation steps for one set point of the arm
-_SOLREF = (0.008, 1.0)  # contacts this stiff, and with this impedance, let a block sink in by less than 0.01 mm under its own weight;
-_SOLIMP = (0.99, 0.999, 0.001, 0.5, 2.0)  # MuJoCo's default lets a tower of five sag by 2 mm
 _CREEP_SPEED = 0.06  # metres a second: the last stretch before contact
 _CREEP = 0.006  # metres: that stretch begins this far above where contact is expected
 _OVERSHOOT = 0.012  # metres: the tip looks for contact down to this far below where it is expected
@@ -68,7 +65,7 @@ class World:
         self._spec = spec or types.MapSpec()
         self.model = scenes.build_model(task, scene)
         self.data = mujoco.MjData(self.model)
-        _configure(self.model)
+        self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # a diverged step is an outcome, not a reset
         self._index(len(np.asarray(scene.size)))
         self.reset(scene.start)
 
@@ -240,7 +237,6 @@ class World:
         model = self.model
         self._arm = robot.Arm(model)
         self._bodies = [model.body(f"object{i}").id for i in range(num_objects)]
-        model.geom_conaffinity[np.isin(model.geom_bodyid, self._bodies)] = robot.OBJECT_CONAFFINITY  # the arm's links hit objects too
         free = model.body_jntadr[self._bodies]
         self._free = model.jnt_qposadr[free][:, None] + np.arange(7)
         self._free_speed = model.jnt_dofadr[free][:, None] + np.arange(6)
@@ -270,17 +266,6 @@ class Worlds:
 
 def _step(world: World, action: types.PickPlace | None) -> Outcome | None:
     return None if action is None else world.step(action)
-
-
-def _configure(model: mujoco.MjModel) -> None:
-    """Set the solver options that the primitive was tuned with."""
-    model.opt.timestep = _TIMESTEP
-    model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    model.opt.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    model.opt.impratio = 10.0
-    model.geom_solref[:] = _SOLREF
-    model.geom_solimp[:] = _SOLIMP
-    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
 
 
 def _checked(action: types.PickPlace) -> tuple[np.ndarray, np.ndarray, float]:

@@ -115,10 +115,12 @@ def render_batch(
         "intrinsics": (camera.intrinsics, 3), "pose": (camera.world_from_cam, 3),
     }  # fmt: skip
     axes = {name: (0 if leaf.ndim == rank + 1 else None) for name, (leaf, rank) in fields.items()}
-    layer_axes = None if layer is None else jax.tree.map(lambda _: None if layer.depth.ndim == 3 else 0, layer)
+    layer_axes = None
     if layer is not None:
+        lead = None if layer.depth.ndim == 3 else 0
         layer_camera = types.Camera(axes["intrinsics"], axes["pose"], camera.height, camera.width)
-        layer, layer_axes = layer.replace(camera=camera), layer_axes.replace(camera=layer_camera)
+        layer_axes = jax.tree.map(lambda _: lead, layer).replace(camera=layer_camera)
+        layer = layer.replace(camera=camera)
 
     def one(leaves, layer):
         model_ = model.replace(geom_size=leaves["size"], geom_rgba=leaves["rgba"])

@@ -108,7 +108,7 @@ def tip_path(start: np.ndarray, end: np.ndarray, *, spacing: float) -> np.ndarra
     polar = [np.array([np.arctan2(p[1], p[0]), np.hypot(p[0], p[1]), p[2], p[3]]) for p in (start, end)]
     length = np.linalg.norm(end[:3] - start[:3])
     count = int(np.ceil(max(length / spacing, abs(polar[1][3] - polar[0][3]) / 0.8, 2.0)))
-    azimuth, radius, z, yaw = np.linspace(*polar, count + 1).T
+    azimuth, radius, z, yaw = np.linspace(polar[0], polar[1], count + 1).T
     return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), z, yaw], axis=-1)
 
 

@@ -173,7 +173,6 @@ def test_turning_what_is_picked_rolls_the_place_logits(variables, quarters):
     place = jax.jit(lambda current: net.apply({"params": params}, current, goal, match, jnp.asarray(pick), method="place").logits)
 
     def turned(times):
-        # (row, col) = (y, x): +x goes to +y where (row, col) goes to (col, -row), which numpy calls rot90 by -1 ... checked below
         return jax.tree.map(lambda leaf: jnp.zeros_like(leaf).at[around, around].set(_quarter_turn(leaf[around, around], times)), whole)
 
     np.testing.assert_allclose(place(turned(quarters)), np.roll(place(turned(0)), -2 * quarters, axis=0), atol=1e-4)
@@ -198,7 +197,8 @@ def test_refine_reads_the_patch_under_the_cell(variables):
     refine = jax.jit(lambda place: NET.apply(variables, place, jnp.int32(3), jnp.array([20, 10]), method="refine"))
     before = refine(place)
     far = jnp.ones((40, 20, 1), bool).at[16:24, 6:14].set(False)
-    other = place.replace(key_input=jnp.where(far, 7.0, place.key_input), crops=jnp.where(jnp.arange(8)[:, None, None, None] == 3, place.crops, 7.0))
+    crops = jnp.where(jnp.arange(8)[:, None, None, None] == 3, place.crops, 7.0)
+    other = place.replace(key_input=jnp.where(far, 7.0, place.key_input), crops=crops)
     np.testing.assert_array_equal(refine(other), before)
     assert not np.array_equal(refine(place.replace(key_input=place.key_input.at[16, 6].add(1.0))), before)
     assert not np.array_equal(refine(place.replace(crops=place.crops.at[3].add(1.0))), before)

@@ -114,10 +114,10 @@ class Task:
     def __post_init__(self):
         if self.colors not in PALETTES:
             raise ValueError(f"task {self.name}: colors={self.colors!r} is not one of {sorted(PALETTES)}")
-        if self.max_actions is None:
-            object.__setattr__(self, "max_actions", self.default_max_actions())
-        if self.max_actions < 1:
-            raise ValueError(f"task {self.name}: max_actions={self.max_actions} must be at least 1")
+        budget = self.default_max_actions() if self.max_actions is None else self.max_actions
+        if budget < 1:
+            raise ValueError(f"task {self.name}: max_actions={budget} must be at least 1")
+        object.__setattr__(self, "max_actions", budget)
 
     def default_max_actions(self) -> int:
         """Give the action budget that the benchmark grants."""
