@@ -3,7 +3,7 @@
     python -m lala_jax.train --config=configs/tower.py                       # 500 demonstrations, 2 CPU cores
     python -m lala_jax.train --config=configs/tower.py:smoke                 # every part, in minutes
     python -m lala_jax.train --config=configs/tower.py:paper                 # the paper's two-stream agent, for a GPU
-    python -m lala_jax.train --config=configs/tower.py --config.task.num_objects=3
+    python -m lala_jax.train --config=configs/tower.py --config.task.num_objects=3 --config.data.directory=data/tower3 --workdir=runs/tower3
 
 Hardware, time and scores of the runs reported are in the README. The paper: 15.8 with 500 demonstrations (two streams, max-height map).
 """

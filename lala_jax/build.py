@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lala_jax import observe, optim, options, policy, train_step, types
+from lala_jax import checkpoint, dataset, observe, optim, options, policy, train_step, types
 from lala_jax.models import goal_aware, transporter
 from lala_jax.sim import scene, tasks
 from lala_jax.sim.tasks import base
@@ -16,6 +16,14 @@ from lala_jax.sim.tasks import base
 MODELS = ("goal_aware", "single", "two_stream", "two_stream_lateral")
 SPLITS = ("train", "val", "test")
 TEST_START = 10_001
+WORKDIR = "runs/<task>"  # the default of --workdir
+SELECTION_START = 4000  # the place in the val split from which episodes choose the best checkpoint: far from those reported
+USER_ERRORS = (dataset.DatasetError, checkpoint.CheckpointError, base.NoFreePose)  # their messages say all
+
+
+def workdir(config: Mapping[str, Any], given: str) -> str:
+    """Put the task's name into the default work directory."""
+    return given.replace("<task>", config["task"]["name"])
 
 
 def task(config: Mapping[str, Any]) -> base.Task:

@@ -70,13 +70,13 @@ class Checkpoints:
         _remove(folder, _steps(folder)[self.keep :])
 
     def save_best(self, step: int, state: Any, score: float, *, config: Mapping[str, Any], input_spec: Mapping[str, Any]) -> bool:
-        """Commit `state` as the best if `score` (finite, higher is better) beats the stored one; say whether it did."""
+        """Commit `state` as the best if `score` (finite, higher is better) is at least the stored one; say whether it was."""
         if not np.isfinite(score):
             raise CheckpointError(f"score of step {step} must be finite, got {score}")
         folder = self.directory / "best"
         self._drop_damaged(folder)
         before = _steps(folder)
-        if any(score <= _stored_score(folder, other) for other in before):
+        if any(score < _stored_score(folder, other) for other in before):
             return False
         _save(folder, step, state, {"config": config, "input_spec": input_spec, "score": float(score)})
         _remove(folder, [other for other in before if other != step])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lala_jax import dataset, options, recording
+from lala_jax import build, options, recording
 
 
 def main(config, workdir) -> None:
@@ -12,4 +12,4 @@ def main(config, workdir) -> None:
 
 
 if __name__ == "__main__":
-    options.run(main, workdir="runs", user_errors=(dataset.DatasetError,))
+    options.run(main, workdir=build.WORKDIR, user_errors=build.USER_ERRORS)

@@ -45,7 +45,7 @@ def get(arg: str, *, task: str) -> ml_collections.ConfigDict:
     config.model.stages = 4  # of the paper's hourglass
     config.model.trunk_width = 48
     config.model.trunk_blocks = 3
-    config.model.tokens = 512  # goal voxels that the pick is matched with
+    config.model.tokens = 704  # goal voxels that the pick is matched with
     config.model.multi_action = True  # supervise every right action, not one
     config.model.match_weight = 1.0
     config.model.refine = True  # regress below the cell and the bin

@@ -27,7 +27,16 @@ def main(config, workdir, *, checkpoint: str, agent: str, split: str, start: int
         )  # fmt: skip
     else:
         result = scoring.baseline(agent, build.task(config), seeds=seeds, threads=threads)
-    scoring.write_scores(config, result, strips, pathlib.Path(workdir), agent=agent, split=split, seeds=seeds, source=checkpoint or None)
+    scoring.write_scores(
+        config,
+        result,
+        strips,
+        pathlib.Path(build.workdir(config, workdir)),
+        agent=agent,
+        split=split,
+        seeds=seeds,
+        source=checkpoint or None,
+    )
     return result
 
 
@@ -43,6 +52,6 @@ if __name__ == "__main__":
         main,
         flags={"checkpoint": "", "agent": "policy", "split": "", "start": -1, "episodes": 0},
         config_from=stored_config,
-        workdir="runs/evaluate",
-        user_errors=(checkpoint.CheckpointError,),
+        workdir=build.WORKDIR + "/eval",
+        user_errors=build.USER_ERRORS,
     )

@@ -13,6 +13,9 @@ from lala_jax.sim import render, scene
 from lala_jax.sim.tasks import base
 
 
+BASELINE = 0.055  # metres between the two imagers of a RealSense D415
+
+
 @dataclasses.dataclass(frozen=True)
 class Observer:
     """How a task's scenes are looked at; hashable, so that it may be a static argument."""
@@ -48,7 +51,9 @@ class Observer:
         if self.depth_noise:
             if key is None:
                 raise ValueError("Observer(depth_noise=True).maps needs a key to draw the noise")
-            views = views.replace(depth=noise.depth_noise(key, views.depth))
+            with jax.ensure_compile_time_eval():
+                disparity = BASELINE * float(self.camera.intrinsics[0, 0, 0])
+            views = views.replace(depth=noise.depth_noise(key, views.depth, disparity=disparity))
         return topdown.from_views_batch(views, spec=self.spec)
 
     def check(self) -> None:

@@ -11,7 +11,7 @@ SCHEDULES = ("cosine", "constant")
 
 
 def schedule(name: str, *, peak: float, warmup: int, steps: int) -> optax.Schedule:
-    """Give the learning rate over optimiser steps: a linear warm-up, then constant or a cosine down to zero at `steps`."""
+    """Give the learning rate over optimiser steps: a linear warm-up, then constant or a cosine down to 1% at `steps`."""
     if name == "constant":
         return optax.linear_schedule(0.0, peak, max(warmup, 1))
     if name == "cosine":

@@ -1,4 +1,4 @@
-"""The door between the command line, config files and the code: the only place that sees `ml_collections`.
+"""The door between the command line, config files and the code: `defaults` aside the only place that sees `ml_collections`.
 
     python -m lala_jax.train --config=configs/pallet.py:smoke --workdir=/tmp/x --config.train.steps=10
 

@@ -103,6 +103,8 @@ def cause(scene: types.Scene, ready: np.ndarray, before: np.ndarray, after: np.n
         return "missed pick"
     if not outcome.held_to_place:
         return "lost on the way"
+    if before[index]:
+        return "wrong object"
     if (before & ~after).any():
         return "knocked over"
     if after[index]:

@@ -1,14 +1,16 @@
 """Train a policy from demonstrations: `python -m lala_jax.train --config=configs/pallet.py --workdir=runs/pallet`.
 
-Collects the demonstrations if there are none, trains, evaluates, and leaves in the work directory: `checkpoints/` (latest and best),
-`metrics.jsonl` and TensorBoard events, `scores-val.json`, `episode-*.webp`. Started again, it goes on where it stopped, bit for bit.
+Collects the demonstrations if there are none, trains, evaluates, and leaves in the work directory `checkpoints/` (latest and best),
+`metrics.jsonl` and TensorBoard events, `scores-policy-val.json`, `episode-val-*.webp`. Started again, it goes on where it stopped, bit
+for bit.
 """
 
 from __future__ import annotations
 
 import pathlib
+import signal
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -42,12 +44,29 @@ def load_states(config: Mapping[str, Any]) -> types.State:
     return jax.tree.map(jnp.asarray, types.State(**dataset.stack(demos)))
 
 
-def start_or_resume(recipe: train_step.Recipe, store: checkpoint.Checkpoints, seed: int) -> state.TrainState:
-    """Make a fresh state, or restore the newest intact one of the same shapes."""
-    key = jax.random.key(seed, impl="rbg")  # compiles four times faster than the default generator, once a layer
+def start_or_resume(config: Mapping[str, Any], recipe: train_step.Recipe, store: checkpoint.Checkpoints) -> state.TrainState:
+    """Make a fresh state, or restore the newest intact one; raises CheckpointError where it is of a run with other settings."""
+    key = jax.random.key(config["seed"], impl="rbg")  # compiles four times faster than the default generator, once a layer
     fresh = jax.jit(lambda key: state.create(recipe.policy.init(key), recipe.optimizer))(key)
+    fresh = jax.device_put(fresh, jax.devices()[0])  # committed to it, as what is restored: both then run one compiled step
     found = store.restore_latest(fresh)
-    return fresh if found is None else found[1]
+    if found is None:
+        return fresh
+    there = run_settings(checkpoint.describe(store.directory / "latest" / str(found[0]))["config"])
+    here = run_settings(writers.plain(options.to_dict(config)))
+    changed = [
+        f"{name} ({there.get(name)} there, {here.get(name)} here)" for name in sorted(there | here) if there.get(name) != here.get(name)
+    ]
+    if changed:
+        raise checkpoint.CheckpointError(f"{store.directory} holds a run with another {', '.join(changed)}: choose another --workdir")
+    return found[1]
+
+
+def run_settings(config: Mapping[str, Any]) -> dict[str, Any]:
+    """List the fields that make a run what it is, by dotted name: all but those that say how often to report and where data lie."""
+    free = ("eval.", "data.directory", "data.threads", "train.log_every", "train.save_every", "train.eval_every", "train.eval_episodes")
+    flat = {f"{group}.{name}": value for group, fields in config.items() if group != "seed" for name, value in fields.items()}
+    return {"seed": config["seed"]} | {name: value for name, value in flat.items() if not name.startswith(free)}
 
 
 def train_and_evaluate(config, workdir: str) -> dict[str, Any]:
@@ -56,12 +75,14 @@ def train_and_evaluate(config, workdir: str) -> dict[str, Any]:
     recipe = build.recipe(config)
     states = load_states(config)
     store = checkpoint.Checkpoints(out / "checkpoints")
+    run = start_or_resume(config, recipe, store)
     writers.write_json(out / "config.json", options.to_dict(config))
-    run = start_or_resume(recipe, store, config.seed)
     count = state.parameter_count(run.params)
     print(f"{config.task.name}: {count:,} parameters, {states.size.shape[0]} states, step {int(run.step)}", flush=True)
     stored = {"config": options.to_dict(config), "input_spec": build.input_spec(config)}
-    with writers.Writer(out) as writer, checkpoint.stop_signals() as stopped:
+    with writers.Writer(out) as writer, checkpoint.stop_signals((signal.SIGTERM, signal.SIGINT)) as stopped:
+        if run.step > 0 and validation_due(config, int(run.step)) and not was_validated(out, int(run.step)):
+            _validate(config, recipe, run, store, stored, writer)  # the last run was stopped between saving and scoring
         run = _loop(config, recipe, run, states, store, stored, writer, stopped)
         if int(run.step) < config.train.steps:
             raise SystemExit(f"stopped at step {int(run.step)}; the same command goes on from there")
@@ -79,8 +100,7 @@ def _loop(config, recipe, run, states, store, stored, writer, stopped) -> state.
             run, metrics = step(recipe, run, states, key)
             seen.append(metrics)
             if number % config.train.log_every == 0 or number == total:
-                values = mean_metrics(seen)
-                check_finite(number, values)
+                values = mean_metrics(seen, last=number)
                 values["seconds_per_step"], seen, begin = (time.time() - begin) / len(seen), [], time.time()
                 writer.scalars(number, values)
                 note = f"loss {values['loss']:.2f}, pick {values['pick_right']:.2f}, place {values['place_right']:.2f}"
@@ -91,36 +111,47 @@ def _loop(config, recipe, run, states, store, stored, writer, stopped) -> state.
             bar.update(shown, completed=number)
             leaving = stopped()
             if number % config.train.save_every == 0 or number == total or leaving:
-                check_finite(number, mean_metrics([metrics]))
+                mean_metrics([metrics], last=number)
                 store.save_latest(number, run, **stored)
             if leaving:
                 break
-            if number % config.train.eval_every == 0 or number == total:
+            if validation_due(config, number):
                 _validate(config, recipe, run, store, stored, writer)
                 begin = time.time()
     return run
 
 
-def mean_metrics(seen) -> dict[str, float]:
-    """Average a list of metric dicts, leaving out NaN where a step did not define one of the accuracies."""
-    host = jax.device_get(seen)
-    out = {}
-    for name in host[0]:
-        values = np.array([float(metrics[name]) for metrics in host])
-        strict = name.startswith("loss") or name == "grad_norm"
-        out[name] = float(values.mean() if strict or np.isnan(values).all() else np.nanmean(values))
-    return out
+def validation_due(config, number: int) -> bool:
+    """Say whether the parameters after step `number` are scored on the val split."""
+    return number % config.train.eval_every == 0 or number == config.train.steps
+
+
+def was_validated(out: pathlib.Path, number: int) -> bool:
+    """Say whether the metrics hold a validation of step `number`."""
+    return any(row["step"] == number and "val_score" in row for row in writers.read_metrics(out / "metrics.jsonl"))
+
+
+def mean_metrics(seen: Sequence[Mapping[str, jax.Array]], *, last: int) -> dict[str, float]:
+    """Average the metrics of the steps up to `last`, leaving out NaN where a step did not define one of the accuracies.
+
+    Raises NonFiniteError naming the first step with a loss or gradient norm that is not finite.
+    """
+    host = [{name: float(value) for name, value in metrics.items()} for metrics in jax.device_get(list(seen))]
+    for number, metrics in enumerate(host, last - len(host) + 1):
+        check_finite(number, metrics)
+    columns = {name: np.array([metrics[name] for metrics in host]) for name in host[0]}
+    return {name: float(np.nan if np.isnan(values).all() else np.nanmean(values)) for name, values in columns.items()}
 
 
 def _validate(config, recipe, run, store, stored, writer) -> None:
-    """Score the averaged parameters on the first val episodes and keep them if they are the best."""
-    seeds = build.split_seeds("val", 0, config.train.eval_episodes)
+    """Score the averaged parameters on val episodes set apart for this and keep them if they are the best."""
+    seeds = build.split_seeds("val", build.SELECTION_START, config.train.eval_episodes)
     result, _ = scoring.evaluate(
         recipe.policy, run.average, recipe.observer, seeds=seeds, parallel=min(config.eval.parallel, len(seeds)),
         threads=config.data.threads,
     )  # fmt: skip
-    writer.scalars(int(run.step), {"val_score": result["score"], "val_complete_percent": result["complete_percent"]})
     store.save_best(int(run.step), run, result["score"], **stored)
+    writer.scalars(int(run.step), {"val_score": result["score"], "val_complete_percent": result["complete_percent"]})
 
 
 def final_scores(config, recipe, params, out: pathlib.Path) -> dict[str, Any]:
@@ -137,8 +168,8 @@ def final_scores(config, recipe, params, out: pathlib.Path) -> dict[str, Any]:
 
 def main(config, workdir) -> None:
     """Train and evaluate."""
-    train_and_evaluate(config, workdir)
+    train_and_evaluate(config, build.workdir(config, workdir))
 
 
 if __name__ == "__main__":
-    options.run(main, workdir="runs/train", user_errors=(dataset.DatasetError, checkpoint.CheckpointError, NonFiniteError))
+    options.run(main, workdir=build.WORKDIR, user_errors=(*build.USER_ERRORS, NonFiniteError))

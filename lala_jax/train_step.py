@@ -27,16 +27,16 @@ class Recipe:
     average_decay: float = 0.998
 
 
-def palette() -> np.ndarray:
-    """Give the benchmark's colours `[P, 3]` in 0..1."""
-    return np.array(list(base.COLORS.values()), np.float32) / 255.0
+def palette(task: base.Task) -> np.ndarray:
+    """Give the colours `[P, 3]` in 0..1 that the task draws from."""
+    return np.array([base.COLORS[name] for name in base.PALETTES[task.colors]], np.float32) / 255.0
 
 
 def augmented(recipe: Recipe, key: jax.Array, example: types.State) -> types.State:
     """Recolour and move one example, scene and goal alike. Unbatched."""
     key_color, key_rigid = jax.random.split(key)
     if recipe.recolor:
-        example = augment.recolor(key_color, example, palette=jnp.asarray(palette()))
+        example = augment.recolor(key_color, example, palette=jnp.asarray(palette(recipe.observer.task)))
     if recipe.rigid:
         radius = float(np.linalg.norm(recipe.observer.task.base_size[:2])) / 2
         example = augment.rigid(key_rigid, example, spec=recipe.observer.spec, base_radius=radius)
@@ -70,5 +70,5 @@ def train_step(recipe: Recipe, run: state.TrainState, states: types.State, key: 
         return losses.mean(), jax.tree.map(jnp.nanmean, metrics)
 
     (_, metrics), grads = jax.value_and_grad(mean_loss, has_aux=True)(run.params)
-    metrics["grad_norm"] = optax.global_norm(grads)
+    metrics["grad_norm"] = optax.tree.norm(grads)
     return state.update(run, grads, recipe.optimizer, average_decay=recipe.average_decay), metrics

@@ -1,4 +1,4 @@
-"""Manners of the package: who imports whom, docstrings, keyword-only options, and that everything imports and builds."""
+"""Manners of the package: who imports whom, docstrings, and that everything imports and builds."""
 
 import ast
 import importlib

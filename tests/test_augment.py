@@ -8,8 +8,9 @@ from test_losses import SPEC, on_device, state_of
 
 from lala_jax import augment, losses, train_step, types
 from lala_jax.perception import transforms
+from lala_jax.sim import tasks
 
-PALETTE = jnp.asarray(train_step.palette())
+PALETTE = jnp.asarray(train_step.palette(tasks.get("pallet")))
 
 
 def test_recolor_without_noise_deals_the_palette():

@@ -60,13 +60,21 @@ def test_shapes(variables):
     assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves((match.pick, place, offset)))
 
 
-def test_jit_equals_eager_and_vmap_equals_a_loop(variables):
+def test_vmap_equals_a_loop(variables):
     pairs, cells = [(random_map(0), random_map(1)), (random_map(2), random_map(0))], jnp.array([[13, 6], [39, 0]])
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *pairs)
     batch = jax.jit(jax.vmap(NET.apply, (None, 0, 0, 0)))(variables, *stacked, cells)
-    for index, (pair, how) in enumerate(zip(pairs, (NET.apply, run), strict=True)):
-        one = how(variables, *pair, cells[index])
+    for index, pair in enumerate(pairs):
+        one = run(variables, *pair, cells[index])
         jax.tree.map(lambda all_, one, index=index: np.testing.assert_allclose(all_[index], one, atol=1e-4), batch, one)
+
+
+def test_jit_equals_eager(variables):
+    """The refinement and the target mask, which hold every kind of step but the convolutional trunk."""
+    match, place, _ = run(variables, random_map(0), random_map(1), PICK)
+    for method, inputs in (("refine", (place, jnp.int32(2), PICK)), ("target_mask", (random_map(1), match, PICK))):
+        eager = NET.apply(variables, *inputs, method=method)
+        np.testing.assert_allclose(jax.jit(lambda *x, how=method: NET.apply(variables, *x, method=how))(*inputs), eager, atol=1e-5)
 
 
 def test_starts_near_zero(variables):
@@ -110,6 +118,33 @@ def test_pool_equals_a_loop():
                 assert count[row, col, level] == total
                 mean = sum(counts[cell] * features[cell] for cell in cells) / max(total, 1)
                 np.testing.assert_allclose(color[row, col, level], mean, atol=1e-5)
+
+
+def test_voxel_input_equals_a_loop():
+    """Own, above, below and around: colour less the mean, 0 where nothing was seen, and whether something was."""
+    rng = np.random.default_rng(0)
+    count = np.maximum(rng.integers(-2, 4, (5, 4, 3)), 0).astype(np.float32)
+    color = rng.random((5, 4, 3, 3)).astype(np.float32) * (count > 0)[..., None]
+    given = np.asarray(goal_aware._voxel_input(jnp.asarray(color), jnp.asarray(count)))
+
+    def at(cells):
+        cells = [c for c in cells if all(0 <= i < n for i, n in zip(c, count.shape, strict=True)) and count[c] > 0]
+        total = sum(float(count[c]) for c in cells)
+        return [0, 0, 0, 0] if not cells else [*(sum(color[c].astype(float) * count[c] for c in cells) / total - 0.5), 1]
+
+    for i, j, k in np.ndindex(count.shape):
+        around = [(i + a, j + b, k) for a in (-1, 0, 1) for b in (-1, 0, 1)]
+        expected = [*at([(i, j, k)]), *at([(i, j, k + 1)]), *at([(i, j, k - 1)]), *at(around)]
+        np.testing.assert_allclose(given[i, j, k], expected, atol=1e-5)
+
+
+def test_highest_takes_the_top_occupied_slice():
+    rng = np.random.default_rng(0)
+    values, seen = rng.normal(size=(5, 4, 3, 2)).astype(np.float32), rng.random((5, 4, 3)) < 0.5
+    given = goal_aware._highest(jnp.asarray(values), jnp.asarray(seen))
+    for i, j in np.ndindex(5, 4):
+        if seen[i, j].any():
+            np.testing.assert_array_equal(given[i, j], values[i, j, np.flatnonzero(seen[i, j])[-1]])
 
 
 def test_tokens_are_the_goal_voxels_that_differ(variables):

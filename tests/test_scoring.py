@@ -1,0 +1,142 @@
+"""Closed-loop scores do not depend on how many episodes are observed at once; a checkpoint of another model is refused by name."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_train_step import tiny_config
+
+from lala_jax import build, checkpoint, options, rollout, scoring
+
+SINGLE = ("model.name=single", "model.stages=1", "model.multi_action=false")
+SEEDS = [1, 3, 5]
+
+
+def drawn_params(agent, seed=0):
+    """Parameters drawn by numpy: what is scored here need not be good, and `init` is slow to compile."""
+    rng = np.random.default_rng(seed)
+    shapes = jax.eval_shape(agent.init, jax.random.key(0))
+    return jax.tree.map(lambda s: jnp.asarray(rng.normal(0, np.prod(s.shape[:-1]) ** -0.5, s.shape), jnp.float32), shapes)
+
+
+@pytest.fixture(scope="module")
+def built():
+    config = tiny_config(*SINGLE)
+    agent = build.build_policy(config)
+    return agent, drawn_params(agent), build.observer(config)
+
+
+@pytest.fixture(scope="module")
+def alone(built):
+    """Every episode observed on its own, with pictures: `(summary, pictures, episodes)`."""
+    return scored(built, parallel=1, strips=2)
+
+
+def scored(built, *, parallel, strips=0):
+    episodes, said = [], []
+    real = rollout.run
+
+    def run(*args, **options):
+        done = real(*args, **options)
+        episodes.extend(done)
+        return done
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rollout, "run", run)
+        summary, pictures = scoring.evaluate(
+            *built, seeds=SEEDS, parallel=parallel, threads=1, strips=strips, progress=lambda done, total: said.append((done, total))
+        )
+    assert said[-1] == (3, 3)
+    return summary, pictures, episodes
+
+
+@pytest.mark.parametrize("parallel", [2, 3])  # 2 leaves an episode over, which is padded
+def test_parallel_changes_nothing(built, alone, parallel):
+    summary, pictures, episodes = scored(built, parallel=parallel)
+    assert summary == alone[0] and pictures == []
+    assert [episode.seed for episode in episodes] == SEEDS
+    for one, many in zip(alone[2], episodes, strict=True):
+        assert len(one.actions) == len(many.actions) > 0
+        for a, b in zip(one.actions, many.actions, strict=True):
+            jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-5), a, b)
+        np.testing.assert_allclose(one.poses[-1], many.poses[-1], atol=1e-4)
+
+
+def test_summary_counts_what_happened(alone):
+    summary, _, episodes = alone
+    assert summary["episodes"] == 3 and summary["actions"] == sum(len(episode.actions) for episode in episodes)
+    assert summary["score"] == np.mean([episode.score for episode in episodes])
+    assert sum(summary["actions_by_cause"].values()) == summary["actions"]
+    assert [line["seed"] for line in summary["per_episode"]] == SEEDS
+
+
+def test_strips_are_drawn_for_the_first_episodes(alone):
+    _, pictures, episodes = alone
+    assert len(pictures) == 2
+    for picture, episode in zip(pictures, episodes, strict=False):
+        assert picture.dtype == np.uint8 and picture.ndim == 3 and picture.shape[-1] == 3
+        assert picture.shape[0] > 100 * len(episode.actions) or picture.shape[1] > 100 * len(episode.actions)
+        assert np.ptp(picture) > 100
+
+
+def test_scores_and_pictures_are_written(alone, tmp_path, capsys):
+    summary, pictures, _ = alone
+    config = tiny_config(*SINGLE)
+    scoring.write_scores(config, summary, pictures, tmp_path, agent="policy", split="val", seeds=SEEDS, source="there")
+    stored = json.loads((tmp_path / "scores-policy-val.json").read_text())
+    assert stored["score"] == summary["score"] and stored["seeds"] == [1, 5] and stored["checkpoint"] == "there"
+    assert options.to_dict(options.from_dict(stored["config"])) == options.to_dict(config)
+    assert sorted(path.name for path in tmp_path.glob("*.webp")) == ["episode-val-0.webp", "episode-val-1.webp"]
+    assert f"score {summary['score']:.1f}" in capsys.readouterr().out
+
+
+def save(path, config):
+    """A checkpoint of a fresh policy of `config`, as training leaves it."""
+    params = drawn_params(build.build_policy(config))
+    stored = {"config": options.to_dict(config), "input_spec": build.input_spec(config)}
+    checkpoint.Checkpoints(path).save_best(1, {"average": params}, 50.0, **stored)
+    return params
+
+
+def test_a_checkpoint_comes_back(tmp_path):
+    config = tiny_config(*SINGLE)
+    params = save(tmp_path, config)
+    loaded = scoring.check_checkpoint(str(tmp_path), config, build.build_policy(config))
+    assert jax.tree.structure(loaded) == jax.tree.structure(params)
+    jax.tree.map(np.testing.assert_array_equal, loaded, params)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("model.width=8", r"is of another model: key_net/\S+/kernel is \(.*\) there, \(.*\) in the config"),
+        ("model.name=two_stream", r"is of another model: key_net/current/\S+ is None there, \(.*\) in the config"),
+        ("map.cell=0.025", r"expects the input .*'rows': 80.*, the config makes .*'rows': 40"),
+        ("map.slices=7", r"expects the input .*'slices': 14.*, the config makes .*'slices': 7"),
+    ],
+)
+def test_a_checkpoint_of_another_model_is_refused(tmp_path, change, message):
+    save(tmp_path, tiny_config(*SINGLE))
+    other = tiny_config(*SINGLE, change)
+    with pytest.raises(checkpoint.MismatchError, match=message):
+        scoring.check_checkpoint(str(tmp_path), other, build.build_policy(other))
+
+
+def test_the_shapes_of_the_first_leaf_that_differs_are_named(tmp_path):
+    save(tmp_path, tiny_config(*SINGLE))
+    other = tiny_config(*SINGLE, "model.channels=5")
+    with pytest.raises(checkpoint.MismatchError, match=r"head_identity/expand/kernel is \(1, 1, 2, 2\) there, \(1, 1, 5, 5\) in the config"):
+        scoring.check_checkpoint(str(tmp_path), other, build.build_policy(other))
+
+
+def test_an_unknown_agent_is_refused():
+    with pytest.raises(options.OptionsError, match="agent must be one of 'oracle', 'blind', got 'random'"):
+        scoring.baseline("random", build.task(tiny_config()), seeds=SEEDS, threads=1)
+
+
+def test_the_blind_agent_falls_behind_the_oracle():
+    task = build.task(tiny_config())
+    oracle, blind = (scoring.baseline(name, task, seeds=list(range(1, 13, 2)), threads=1) for name in ("oracle", "blind"))
+    assert oracle["score"] == 100 > blind["score"]
