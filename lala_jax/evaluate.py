@@ -12,6 +12,8 @@ from typing import Any
 
 from lala_jax import build, checkpoint, options, scoring
 
+NO_CHECKPOINT = "give --checkpoint=PATH, or --config=FILE.py with --agent=oracle or --agent=blind"
+
 
 def main(config, workdir, *, checkpoint: str, agent: str, split: str, start: int, episodes: int) -> dict[str, Any]:
     """Score the checkpoint, or the oracle or the blind agent, and write scores and pictures to the work directory."""
@@ -19,6 +21,8 @@ def main(config, workdir, *, checkpoint: str, agent: str, split: str, start: int
     split, threads, strips = split or config.eval.split, config.data.threads, []
     seeds = build.split_seeds(split, start if start >= 0 else config.eval.start, episodes or config.eval.episodes)
     if agent == "policy":
+        if not checkpoint:
+            raise options.OptionsError(NO_CHECKPOINT)
         built, observer = build.build_policy(config), build.observer(config)
         params = scoring.check_checkpoint(checkpoint, config, built)
         result, strips = scoring.evaluate(
@@ -43,7 +47,7 @@ def main(config, workdir, *, checkpoint: str, agent: str, split: str, start: int
 def stored_config(flags: Mapping[str, Any]):
     """Give the config that a checkpoint holds."""
     if not flags["checkpoint"]:
-        raise options.OptionsError("give --checkpoint=PATH, or --config=FILE.py with --agent=oracle or --agent=blind")
+        raise options.OptionsError(NO_CHECKPOINT)
     return options.from_dict(checkpoint.describe(flags["checkpoint"])["config"])
 
 

@@ -12,7 +12,6 @@ from lala_jax.perception import noise, topdown
 from lala_jax.sim import render, scene
 from lala_jax.sim.tasks import base
 
-
 BASELINE = 0.055  # metres between the two imagers of a RealSense D415
 
 

@@ -209,7 +209,7 @@ class GoalAwarePolicy:
         offset = jnp.zeros(3)
         if self.refine:
             offset = jnp.clip(model.apply(variables, place, turn, cell, method="refine"), -2.0, 2.0)
-        xy = types.world_from_cell(spec, cell + 0.5 + offset[:2])
+        xy = types.world_from_cell(spec, jnp.clip(cell + 0.5 + offset[:2], 0.0, jnp.array([spec.rows, spec.cols])))
         yaw = (turn + offset[2]) * (2 * math.pi / model.rotations)
         return _to_action(spec, current, pick, xy, yaw), Heatmaps(match.pick, place.logits)
 

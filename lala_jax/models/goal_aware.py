@@ -181,7 +181,7 @@ class GoalAware(nn.Module):
         at = (token[:, 0], token[:, 1], token[:, 2])
         embedding = self.voxel(_voxel_input(goal_color, goal_count)[at])
         token_next = jnp.where(valid, upcoming[at], -1e9)
-        coarse = jax.nn.logsumexp(surface @ embedding.T + token_next, axis=-1)
+        coarse = jnp.where(valid.any(), jax.nn.logsumexp(surface @ embedding.T + token_next, axis=-1), 0.0)
         pick = self._pick_fine(current, goal, context) + _upsample(coarse[..., None], POOL)[..., 0]
         return Match(pick, surface, token, valid, embedding, token_next)
 
