@@ -36,10 +36,8 @@ def main(argv=None) -> None:
     parser.add_argument("--out", type=pathlib.Path, required=True, help="directory for the pictures")
     parser.add_argument("--seed", type=int, default=1, help="seed of both scenes (test scenes start at 10001)")
     args = parser.parse_args(argv)
-    drawn = {name: draw_task(name, args.seed) for name in ("tower", "pallet")}
-    for name, picture in drawn.items():
-        writers.write_image(args.out / f"{name}.png", picture)
-    writers.write_image(args.out / "tasks.webp", pictures.grid(list(drawn.values()), 2))
+    drawn = [draw_task(name, args.seed) for name in tasks.names()]
+    writers.write_image(args.out / "tasks.webp", pictures.grid(drawn, len(drawn)))
 
 
 if __name__ == "__main__":

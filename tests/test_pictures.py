@@ -184,5 +184,4 @@ def test_caption_is_wrapped_not_cut():
 @pytest.mark.slow
 def test_draws_the_tasks(tmp_path):
     report.main([f"--out={tmp_path}"])
-    for name in ("tower.png", "pallet.png", "tasks.webp"):
-        assert (tmp_path / name).stat().st_size > 5_000
+    assert (tmp_path / "tasks.webp").stat().st_size > 5_000
