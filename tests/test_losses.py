@@ -42,16 +42,17 @@ def top_owner(state, xy):
 def test_pick_valid_equals_loop(name):
     state = state_of(name)
     valid = np.asarray(losses.pick_valid(on_device(state), spec=SPEC))
-    for row in range(SPEC.rows):
-        for col in range(SPEC.cols):
-            xy = np.asarray(types.world_from_index(SPEC, np.array([row, col])))
+    assert valid.any((1, 2)).all()
+    centres = np.asarray(losses.cell_centres(SPEC))
+    for row in range(0, SPEC.rows):
+        for col in range(row % 3, SPEC.cols, 3):  # every third cell, all columns in turn
+            xy = centres[row, col]
             index, inside = top_owner(state, xy)
             expected = np.zeros(len(state.size), bool)
             if index >= 0 and inside > losses.PICK_MARGIN:
                 expected[index] = True
             if abs(inside - losses.PICK_MARGIN) > 1e-5:
                 assert (valid[:, row, col] == expected).all(), (row, col)
-    assert valid.any((1, 2)).all()
 
 
 @pytest.mark.parametrize("name", ["tower", "pallet"])

@@ -79,7 +79,8 @@ def test_causes_are_told_apart():
     assert cause(held=False) == "lost on the way"
     assert cause(after=(True, False)) == "right"
     assert cause(index=1) == "wrong object"
-    assert cause(before=(True, False)) == "knocked over"
+    assert cause(before=(False, True)) == "knocked over"
+    assert cause(before=(True, False)) == "wrong object"  # it was in place already
     assert cause(shift=0.03) == "wrong place"
     assert cause(shift=0.0) == "wrong height"
 
