@@ -36,9 +36,7 @@ def check_finite(number: int, metrics: Mapping[str, float]) -> None:
 
 def load_states(config: Mapping[str, Any]) -> types.State:
     """Read the demonstrations (collecting them first where there are none) as training states on the device, leaves `[M, ...]`."""
-    directory = pathlib.Path(config["data"]["directory"])
-    if not (directory / "meta.json").exists() or dataset.seeds(directory).size < config["data"]["demos"]:
-        recording.collect(config)
+    directory = recording.collect(config)
     identity = {"task": config["task"]["name"], "task_options": build.task_options(config)}
     demos, _ = dataset.load(directory, count=config["data"]["demos"], **identity)
     return jax.tree.map(jnp.asarray, types.State(**dataset.stack(demos)))
