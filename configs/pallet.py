@@ -15,6 +15,6 @@ def get_config(arg=""):
     """Give the config; `arg` is "", "smoke" or "paper"."""
     config = defaults.get(arg, task="pallet")
     if arg == "":
-        config.train.steps = 900
-        config.train.eval_every = 450
+        config.train.steps = 1000
+        config.train.eval_every = 500
     return config

@@ -15,6 +15,6 @@ def get_config(arg=""):
     """Give the config; `arg` is "", "smoke" or "paper"."""
     config = defaults.get(arg, task="tower")
     if arg == "":
-        config.train.steps = 400
-        config.train.eval_every = 200
+        config.train.steps = 500
+        config.train.eval_every = 250
     return config

@@ -1,31 +1,87 @@
-"""Augmentation in the scene, before pixels exist: exact, and true to the labels. Unbatched; `key` first."""
+"""Augmentation: of the scene before pixels exist, exact and true to the labels; and of what the cameras report. Unbatched; `key` first."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import jax
 import jax.numpy as jnp
 
 from lala_jax import types
-from lala_jax.perception import transforms
+from lala_jax.perception import noise, transforms
 
 
-def recolor(key: jax.Array, state: types.State, *, palette: jax.Array, jitter: float = 0.04, mix: float = 0.5) -> types.State:
+@dataclasses.dataclass(frozen=True)
+class Sensors:
+    """How the cameras of a training example err; static."""
+
+    depth_noise: float = 0.0  # probability of an image with the noise of `perception.noise.depth_noise`
+    shift: float = 0.0  # metres a camera is off where it is thought to be, at most
+    turn: float = 0.0  # degrees a camera is turned off, at most
+    missing: float = 0.0  # probability that one camera sees nothing
+
+    def __bool__(self):
+        return any(dataclasses.astuple(self))
+
+
+def sensors(key: jax.Array, key_noise: jax.Array, views: types.Views, errors: Sensors, *, disparity: float) -> types.Views:
+    """Let the cameras of one scene (leaves `[V, ...]`) err.
+
+    `key` decides where they are thought to be and which one is missing, the same for all pictures of an episode; `key_noise` the
+    noise of this one. The pictures are those of the cameras where they are: it is the poses they are unprojected from that change.
+    """
+    key_move, key_missing, key_which, key_coin = jax.random.split(key, 4)
+    depth = views.depth
+    if errors.depth_noise:
+        noisy = noise.depth_noise(key_noise, depth, disparity=disparity)
+        depth = jnp.where(jax.random.bernoulli(key_coin, errors.depth_noise), noisy, depth)
+    if errors.missing:
+        which = jax.random.randint(key_which, (), 0, depth.shape[0])
+        lost = (jnp.arange(depth.shape[0]) == which) & jax.random.bernoulli(key_missing, errors.missing)
+        depth = jnp.where(lost[:, None, None], 0.0, depth)
+    believed = noise.move_cameras(key_move, views.camera, shift=errors.shift, turn=math.radians(errors.turn))
+    return views.replace(depth=depth, camera=believed)
+
+
+def recolor(
+    key: jax.Array,
+    state: types.State,
+    *,
+    palette: jax.Array,
+    jitter: float = 0.04,
+    mix: float = 0.5,
+    apart: float | None = None,
+    candidates: int = 64,
+) -> types.State:
     """Give the objects new colours, the same in scene and goal since both are drawn from `state.color`.
 
-    Colours are drawn from `palette` `[P, 3]` without replacement (P >= N); with probability `mix` the palette is first mirrored and
-    permuted over its channels (hues unseen in the palette, distances kept); every colour gets normal noise of `jitter`.
+    Colours are drawn from `palette` `[P, 3]` without replacement (P >= N); with probability `mix` uniformly in RGB instead, each
+    `apart` (None: as the closest two of the palette) from the others; every colour gets normal noise of `jitter`.
     """
-    order, permute, flip, noise, coin = jax.random.split(key, 5)
-    channels = jax.random.permutation(permute, 3)
-    other = jnp.take(palette, channels, axis=1)
-    low, high = other.min(), other.max()
-    other = jnp.where(jax.random.bernoulli(flip, 0.5, (3,)), low + high - other, other)
-    palette = jnp.where(jax.random.bernoulli(coin, mix), other, palette)
-    chosen = jax.random.permutation(order, palette.shape[0])[: state.color.shape[0]]
-    color = palette[chosen] + jitter * jax.random.normal(noise, state.color.shape)
+    count = state.color.shape[0]
+    if count > palette.shape[0]:
+        raise ValueError(f"{count} objects cannot be recoloured from a palette of {palette.shape[0]} colours")
+    key_order, key_any, key_jitter, key_coin = jax.random.split(key, 4)
+    if apart is None:
+        distance = jnp.linalg.norm(palette[:, None] - palette, axis=-1)
+        apart = jnp.where(jnp.eye(len(palette), dtype=bool), jnp.inf, distance).min()
+    known = jax.random.permutation(key_order, palette)[:count]
+    unseen = spread(jax.random.uniform(key_any, (candidates, 3)), count, apart=apart)
+    color = jnp.where(jax.random.bernoulli(key_coin, mix), unseen, known)
+    color += jitter * jax.random.normal(key_jitter, color.shape)
     return state.replace(color=jnp.clip(color, 0.0, 1.0))
+
+
+def spread(points: jax.Array, count: int, *, apart: float | jax.Array) -> jax.Array:
+    """Choose `count` of `points` `[P, C]` one after another: the first that is `apart` from all chosen, or the farthest if none is."""
+
+    def choose(nearest, _):
+        far = nearest >= apart
+        index = jnp.where(far.any(), far.argmax(), nearest.argmax())
+        return jnp.minimum(nearest, jnp.linalg.norm(points - points[index], axis=-1)), points[index]
+
+    return jax.lax.scan(choose, jnp.full(len(points), jnp.inf), length=count)[1]
 
 
 def rigid(key: jax.Array, state: types.State, *, spec: types.MapSpec, base_radius: float, tries: int = 16) -> types.State:

@@ -30,18 +30,28 @@ def task(config: Mapping[str, Any]) -> base.Task:
     """Build the task from the config's `task` group."""
     fields = config["task"]
     options.check_choice("task.name", fields["name"], tasks.names())
-    options.check_choice("task.colors", fields["colors"], base.PALETTES)
+    options.check_choice("task.colors", fields["colors"], base.COLOR_CHOICES)
     number = {"num_objects": fields["num_objects"]} if fields["num_objects"] else {}
+    distractors = fields.get("distractors", 0)  # configs in checkpoints may be older than the field
     try:
-        return tasks.get(fields["name"], colors=fields["colors"], **number)
+        return tasks.get(fields["name"], colors=fields["colors"], distractors=distractors, **number)
     except (ValueError, TypeError) as error:
         raise options.OptionsError(str(error)) from error
 
 
 def task_options(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Give what identifies recorded demonstrations beside the task's name."""
+    """Give what identifies recorded demonstrations beside the task's name; what is 0 is left out, as in older recordings."""
     built = task(config)
-    return {"num_objects": built.num_objects, "colors": built.colors}
+    more = {"distractors": built.distractors, "mistakes": mistakes(config)}
+    return {"num_objects": built.num_objects, "colors": built.colors, **{name: value for name, value in more.items() if value}}
+
+
+def mistakes(config: Mapping[str, Any]) -> float:
+    """Give the share of the demonstrations' actions that are spoiled."""
+    share = config["data"].get("mistakes", 0.0)  # configs in checkpoints may be older than the field
+    if not 0.0 <= share < 1.0:
+        raise options.OptionsError(f"config field data.mistakes must be at least 0 and below 1, got {share!r}")
+    return share
 
 
 def map_spec(config: Mapping[str, Any]) -> types.MapSpec:
@@ -94,6 +104,7 @@ def recipe(config: Mapping[str, Any]) -> train_step.Recipe:
     train, augment = config["train"], config["augment"]
     for name in ("steps", "batch_size", "log_every", "save_every", "eval_every", "eval_episodes"):
         _positive(f"train.{name}", train[name])
+    sensors = train_step.augment.Sensors(**{name: augment[name] for name in ("depth_noise", "shift", "turn", "missing")})
     options.check_choice("optim.schedule", config["optim"]["schedule"], optim.SCHEDULES)
     return train_step.Recipe(
         policy=build_policy(config),
@@ -102,6 +113,7 @@ def recipe(config: Mapping[str, Any]) -> train_step.Recipe:
         batch_size=train["batch_size"],
         recolor=augment["recolor"],
         rigid=augment["rigid"],
+        sensors=sensors,
         average_decay=config["optim"]["average_decay"],
     )
 

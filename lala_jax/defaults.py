@@ -19,18 +19,24 @@ def get(arg: str, *, task: str) -> ml_collections.ConfigDict:
     config.task = ml_collections.ConfigDict()
     config.task.name = task  # a name in sim.tasks
     config.task.num_objects = 0  # 0: the task's own number
-    config.task.colors = "paper"  # a palette in sim.tasks.base.PALETTES
+    config.task.colors = "paper"  # one of sim.tasks.base.COLOR_CHOICES: a palette, or uniform
+    config.task.distractors = 0  # further objects on the table that the goal does not show
 
     config.data = ml_collections.ConfigDict()
     config.data.directory = f"data/{task}"  # demonstrations, collected there if there are none
     config.data.demos = 500
+    config.data.mistakes = 0.0  # share of the demonstrations' actions that are spoiled, so that they show how to recover
     config.data.threads = os.cpu_count() or 1  # of physics, in collection and evaluation
 
     config.camera = ml_collections.ConfigDict()
     config.camera.preset = "ring"  # a name in sim.scene.PRESETS
-    config.camera.height = 180  # pixels
-    config.camera.width = 240
+    config.camera.height = 240  # pixels
+    config.camera.width = 320
     config.camera.depth_noise = False
+    config.camera.shift = 0.0  # metres: in evaluation, each episode's cameras are moved by up to so much,
+    config.camera.turn = 0.0  # and turned by up to so many degrees, and nobody says so
+    config.camera.calibrate = True  # in evaluation, find out where the cameras are from the first pictures of the table and the arm
+    config.camera.missing = -1  # the camera that sees nothing; -1: none
 
     config.map = ml_collections.ConfigDict()
     config.map.cell = 0.00625  # metres
@@ -53,6 +59,10 @@ def get(arg: str, *, task: str) -> ml_collections.ConfigDict:
     config.augment = ml_collections.ConfigDict()
     config.augment.recolor = True
     config.augment.rigid = True
+    config.augment.depth_noise = 0.25  # probability of an image with depth noise
+    config.augment.shift = 0.001  # metres: each camera is at most so far from where it is thought to be
+    config.augment.turn = 0.1  # degrees, likewise
+    config.augment.missing = 0.1  # probability that one camera sees nothing
 
     config.optim = ml_collections.ConfigDict()
     config.optim.schedule = "cosine"

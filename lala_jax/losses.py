@@ -34,11 +34,12 @@ def cell_centres(spec: types.MapSpec) -> jax.Array:
     return types.world_from_index(spec, jnp.stack([rows, cols], axis=-1))
 
 
-def pick_valid(state: types.State, *, spec: types.MapSpec, margin: float = PICK_MARGIN) -> jax.Array:
+def pick_valid(state: types.State, *, spec: types.MapSpec, margin: float = PICK_MARGIN, share: float = 1.0) -> jax.Array:
     """Mark which cells are right picks of which object, `[N, rows, cols]` bool.
 
     A cell belongs to the object whose top face is the highest over the cell's centre, and is a pick where
-    the centre is at least `margin` metres inside that face. Objects are taken as upright boxes.
+    the centre is at least `margin` metres inside that face, in the middle `share` of what this leaves of each side (but
+    at least within 0.71 cells of the middle, so that a cell is left). Objects are taken as upright boxes.
     """
     centres = cell_centres(spec)
 
@@ -47,7 +48,7 @@ def pick_valid(state: types.State, *, spec: types.MapSpec, margin: float = PICK_
         object_from_world = transforms.se2_inverse(world_from_object)
         local = jnp.abs(transforms.apply_se2(object_from_world, centres))
         covered = (local < size[:2] / 2).all(-1)
-        inside = (local < size[:2] / 2 - margin).all(-1)
+        inside = (local < jnp.maximum(share * (size[:2] / 2 - margin), 0.71 * spec.cell)).all(-1)
         return jnp.where(covered, pose[2] + size[2] / 2, -jnp.inf), inside
 
     tops, inside = jax.vmap(one)(state.poses, state.size)
@@ -56,12 +57,25 @@ def pick_valid(state: types.State, *, spec: types.MapSpec, margin: float = PICK_
 
 def place_label(state: types.State, index: jax.Array, pick_xy: jax.Array) -> PlaceLabel:
     """Give every right place of the point `pick_xy` `[2]` (metres) on object `index`: its goal pose and the yaws that look alike."""
-    now, goal, symmetry = state.poses[index], state.goal[index], state.symmetry[index]
-    turns = jnp.arange(MAX_SYMMETRY)
-    yaw = transforms.yaw_from_quat(goal[3:]) - transforms.yaw_from_quat(now[3:]) + turns * symmetry
+    turns, symmetry = jnp.arange(MAX_SYMMETRY), state.symmetry[index]
+    xy, yaw = _at_goal(state, index, pick_xy, turns * symmetry)
+    return PlaceLabel(xy=xy, yaw=yaw, valid=turns < jnp.round(2 * math.pi / symmetry))
+
+
+def quarter_label(state: types.State, index: jax.Array, pick_xy: jax.Array) -> PlaceLabel:
+    """Give the places of `pick_xy` with object `index` at its goal, turned by 0..3 quarters; `valid` marks the turns that look alike."""
+    turns = jnp.arange(4) * (math.pi / 2)
+    xy, yaw = _at_goal(state, index, pick_xy, turns)
+    off = turns / state.symmetry[index]
+    return PlaceLabel(xy=xy, yaw=yaw, valid=jnp.abs(off - jnp.round(off)) < 1e-3)
+
+
+def _at_goal(state, index, pick_xy, turns):
+    """Say where a picked point goes, and by which yaw in 0..2 pi, when its object comes to its goal, turned by `turns` `[S]` more."""
+    now, goal = state.poses[index], state.goal[index]
+    yaw = transforms.yaw_from_quat(goal[3:]) - transforms.yaw_from_quat(now[3:]) + turns
     motion = transforms.se2_about(now[:2], yaw, goal[:2] - now[:2])
-    xy = transforms.apply_se2(motion, pick_xy)
-    return PlaceLabel(xy=xy, yaw=jnp.mod(yaw, 2 * math.pi), valid=turns < jnp.round(2 * math.pi / symmetry))
+    return transforms.apply_se2(motion, pick_xy), jnp.mod(yaw, 2 * math.pi)
 
 
 def place_index(label: PlaceLabel, *, spec: types.MapSpec, rotations: int) -> tuple[jax.Array, jax.Array, jax.Array]:

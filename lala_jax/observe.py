@@ -4,15 +4,27 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 
 import jax
+import jax.numpy as jnp
+from flax import struct
 
 from lala_jax import types
-from lala_jax.perception import noise, topdown
-from lala_jax.sim import render, scene
+from lala_jax.perception import calibration, noise, topdown
+from lala_jax.sim import distance, render, scene
 from lala_jax.sim.tasks import base
 
 BASELINE = 0.055  # metres between the two imagers of a RealSense D415
+
+
+@struct.dataclass
+class Rig:
+    """The cameras of E episodes where they are not the preset's, leaves `[E, V, ...]`."""
+
+    camera: types.Camera  # where they are
+    believed: types.Camera  # where they are thought to be
+    background: types.Views | None  # what they see of what never moves, None where they have not moved
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,35 +37,87 @@ class Observer:
     height: int = 480  # pixels
     width: int = 640
     depth_noise: bool = False
-
-    def views(self, size: jax.Array, color: jax.Array, base: jax.Array, poses: jax.Array) -> types.Views:
-        """Render the cameras' views of one scene: objects `[N, 3]`, `[N, 3]`, base `[7]`, poses `[N, 7]`. Unbatched."""
-        model, data = scene.geom_template(self.task)
-        moving = (scene.base_geom(model), *scene.object_geoms(model))
-        model, data = scene.place(model, data, size=size, color=color, poses=poses, base=base)
-        return render.render_over(self.background(), model, data, self.camera, geoms=moving)
+    shift: float = 0.0  # metres, at most, that each episode's cameras are away from where they are thought to be
+    turn: float = 0.0  # degrees, at most, that they are turned
+    calibrate: bool = False  # find out where they are from the first pictures of an episode
+    missing: int = -1  # the camera that sees nothing, -1 for none
 
     @property
     def camera(self) -> types.Camera:
-        """Give the cameras, leaves `[V, ...]`."""
+        """Give the preset's cameras, leaves `[V, ...]`."""
         return scene.cameras(self.preset, height=self.height, width=self.width)
 
+    @property
+    def disparity(self) -> float:
+        """Give the disparity, in pixels, of a point one metre away."""
+        with jax.ensure_compile_time_eval():
+            return BASELINE * float(self.camera.intrinsics[0, 0, 0])
+
+    @property
+    def moves(self) -> bool:
+        """Say whether the cameras may be elsewhere than the preset says, so that `maps` needs a rig."""
+        return bool(self.shift or self.turn or self.calibrate)
+
     def background(self) -> render.Layer:
-        """Give the views of what never moves, the table and the parked arm; computed once."""
+        """Give the preset's views of what never moves, the table and the parked arm; computed once."""
         return _background(self)
 
-    def maps(
-        self, size: jax.Array, color: jax.Array, base: jax.Array, poses: jax.Array, *, key: jax.Array | None = None
-    ) -> types.TopDownMap:
-        """Render and fuse B scenes (leaves `[B, ...]`); `key` draws the depth noise where there is any."""
-        views = jax.vmap(self.views)(size, color, base, poses)
+    def views(self, size: jax.Array, color: jax.Array, base: jax.Array, poses: jax.Array, layer: render.Layer | None = None) -> types.Views:
+        """Render the cameras' views of one scene: objects `[N, 3]`, `[N, 3]`, base `[7]`, poses `[N, 7]`. Unbatched.
+
+        `layer` is the background of other cameras than the preset's.
+        """
+        layer = self.background() if layer is None else layer
+        model, data = scene.geom_template(self.task)
+        moving = (scene.base_geom(model), *scene.object_geoms(model))
+        model, data = scene.place(model, data, size=size, color=color, poses=poses, base=base)
+        return render.render_over(layer, model, data, layer.camera, geoms=moving)
+
+    def look(self, size, color, base, poses, *, key: jax.Array | None = None, layer: render.Layer | None = None) -> types.Views:
+        """Render B scenes (leaves `[B, ...]`) as the cameras report them; `key` draws the depth noise where there is any.
+
+        `layer` (leaves `[B, V, ...]`) is the background of other cameras than the preset's.
+        """
+        views = jax.vmap(self.views)(size, color, base, poses, layer)
         if self.depth_noise:
             if key is None:
-                raise ValueError("Observer(depth_noise=True).maps needs a key to draw the noise")
-            with jax.ensure_compile_time_eval():
-                disparity = BASELINE * float(self.camera.intrinsics[0, 0, 0])
-            views = views.replace(depth=noise.depth_noise(key, views.depth, disparity=disparity))
+                raise ValueError("Observer(depth_noise=True) needs a key to draw the noise")
+            views = views.replace(depth=noise.depth_noise(key, views.depth, disparity=self.disparity))
+        if self.missing >= 0:
+            views = views.replace(depth=views.depth.at[:, self.missing].set(0.0))
+        return views
+
+    def maps(
+        self, size: jax.Array, color: jax.Array, base: jax.Array, poses: jax.Array, *, key: jax.Array | None = None, rig: Rig | None = None
+    ) -> types.TopDownMap:
+        """Look at B scenes (leaves `[B, ...]`) and fuse the views; cameras that may move need the `rig` of `mount`."""
+        if self.moves and rig is None:
+            raise ValueError("an Observer whose cameras move or are calibrated needs the rig of Observer.mount")
+        views = self.look(size, color, base, poses, key=key, layer=None if rig is None else rig.background)
+        if rig is not None:
+            views = views.replace(camera=rig.believed)
         return topdown.from_views_batch(views, spec=self.spec)
+
+    def mount(self, key: jax.Array, size: jax.Array, color: jax.Array, base: jax.Array, poses: jax.Array) -> Rig:
+        """Put up the cameras of E episodes: move them, and calibrate them on the pictures of the first `poses` `[E, N, 7]`."""
+        key_move, key_noise = jax.random.split(key)
+        count, camera = size.shape[0], self.camera
+        keys = jax.random.split(key_move, count)
+        camera = jax.vmap(lambda k: noise.move_cameras(k, camera, shift=self.shift, turn=math.radians(self.turn)))(keys)
+        model, data = scene.geom_template(self.task)
+        static = scene.static_geoms(model)
+        layer = None
+        if self.shift or self.turn:
+            layer = jax.lax.map(lambda one: render.background(model, data, one, geoms=static, segmentation=False), camera)
+        believed = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), self.camera)
+        if self.calibrate:
+            views = self.look(size, color, base, poses, key=key_noise, layer=layer)
+
+            def measure(points):
+                return distance.distance(model, data, points, geoms=static)
+
+            believed = jax.lax.map(lambda one: calibration.calibrate(*one, measure), (views.depth, believed))
+        return Rig(camera, believed, layer)
 
     def check(self) -> None:
         """Raise ValueError naming the first camera of the preset that sees nothing of the table or the arm."""

@@ -18,6 +18,11 @@ from lala_jax.models import goal_aware, transporter
 from lala_jax.perception import topdown
 
 SURFACE_RADIUS = 2  # cells about a point within which its height is the highest seen
+MIDDLE = 0.5  # share of a face's sides within which a pick is taught, as the oracle picks
+QUARTER_NEAR = 0.03  # metres about the best place in which its quarter turns are looked for
+REFINE_DRAWS = 2  # times an object is held over its goal in a training example
+FIT_SCALE = 2.0  # logits per `goal_aware.MISFIT`
+REFINEMENTS = 2  # times a guess is refined
 TOKEN_TOLERANCE = 0.008  # metres a goal voxel's centre may be outside the object it shows
 
 
@@ -32,7 +37,13 @@ class Heatmaps:
 def empty_map(spec: types.MapSpec, *, features: int = 3) -> types.TopDownMap:
     """Give a map in which nothing was seen."""
     grid = (spec.rows, spec.cols, spec.slices)
-    return types.TopDownMap(features=jnp.zeros((*grid, features)), count=jnp.zeros(grid), height=jnp.zeros(grid[:2]))
+    return types.TopDownMap(
+        features=jnp.zeros((*grid, features)),
+        count=jnp.zeros(grid),
+        offset=jnp.zeros((*grid, 2)),
+        height=jnp.zeros(grid[:2]),
+        skin=jnp.zeros((*grid[:2], 2)),
+    )
 
 
 def argmax_index(logits: jax.Array) -> tuple[jax.Array, ...]:
@@ -62,6 +73,7 @@ class Sample:
     """What one training example asks: a pick drawn among the right ones and where it may go."""
 
     pick_valid: jax.Array  # [rows, cols] bool: every right pick now
+    pick_best: jax.Array  # [rows, cols] bool: those around the middle of a face, what a pick is taught
     index: jax.Array  # [] the object of the drawn pick
     pick: jax.Array  # [2] int32 the drawn cell
     drawn: jax.Array  # [] bool: there was something to draw
@@ -85,12 +97,13 @@ def draw(key: jax.Array, state: types.State, *, spec: types.MapSpec, rotations: 
     label = losses.place_label(state, index, types.world_from_index(spec, pick))
     bins, places, valid = losses.place_index(label, spec=spec, rotations=rotations)
     pick_valid = (cells & state.ready[:, None, None]).any(0)
+    pick_best = (losses.pick_valid(state, spec=spec, share=MIDDLE) & state.ready[:, None, None]).any(0)
     if not multi_action:
         least = jnp.argmin(jnp.where(valid, jnp.abs(jnp.mod(label.yaw + math.pi, 2 * math.pi) - math.pi), jnp.inf))
         valid = valid & (jnp.arange(valid.size) == least)
-        pick_valid = jnp.zeros_like(pick_valid).at[pick[0], pick[1]].set(True)
+        pick_valid = pick_best = jnp.zeros_like(pick_valid).at[pick[0], pick[1]].set(True)
     drawn = candidates.any()
-    return Sample(pick_valid, index, pick, drawn, label, bins, places, valid & drawn)
+    return Sample(pick_valid, pick_best, index, pick, drawn, label, bins, places, valid & drawn)
 
 
 def hits(sample: Sample, pick_logits: jax.Array, place_logits: jax.Array, *, spec: types.MapSpec, rotations: int) -> dict[str, jax.Array]:
@@ -133,25 +146,30 @@ class GoalAwarePolicy:
         variables, model, spec = {"params": params}, self.model, self.spec
         candidates = state.ready if not self.multi_action else ~state.placed
         sample = draw(key_draw, state, spec=spec, rotations=model.rotations, candidates=candidates, multi_action=self.multi_action)
-        match = model.apply(variables, current, goal, method="match")
-        place = model.apply(variables, current, goal, match, sample.pick, method="place")
+        match, layout = self._look(variables, current, goal)
+        target = model.apply(variables, match, sample.pick, method="target")
+        place = model.apply(variables, layout, target, sample.pick, method="place")
         terms = {
-            "pick": losses.masked_cross_entropy(match.pick, sample.pick_valid),
+            "pick": losses.masked_cross_entropy(match.pick, sample.pick_best),
             "place": losses.place_cross_entropy(place.logits, sample.bins, sample.cells, sample.valid),
         }
         if self.match_weight:
             terms["match"], terms["next"], match_right = self._match_losses(key_match, state, match)
         if self.refine:
-            terms["refine"], refine_error = self._refine_loss(variables, key_refine, sample, place)
-        total = terms["pick"] + terms["place"]
-        total += self.match_weight * (terms.get("match", 0.0) + terms.get("next", 0.0)) + self.refine_weight * terms.get("refine", 0.0)
+            terms["refine"], terms["fit"], refined = self._refine_losses(variables, key_refine, state, match, layout)
+        total = terms["pick"] + terms["place"] + self.match_weight * (terms.get("match", 0.0) + terms.get("next", 0.0))
+        total += self.refine_weight * (terms.get("refine", 0.0) + terms.get("fit", 0.0))
         metrics = {f"loss_{name}": value for name, value in terms.items()} | {"loss": total}
         metrics |= hits(sample, match.pick, place.logits, spec=spec, rotations=model.rotations)
         if self.match_weight:
             metrics["match_right"] = match_right
         if self.refine:
-            metrics["refine_error"] = refine_error
+            metrics |= refined
         return total, metrics
+
+    def _look(self, variables, current, goal):
+        apply = self.model.apply
+        return apply(variables, current, goal, method="match"), apply(variables, current, goal, method="layout")
 
     def _match_losses(self, key, state, match):
         """Match every unplaced object with its voxels in the goal, and tell the voxels that may be built next."""
@@ -181,37 +199,84 @@ class GoalAwarePolicy:
             jnp.where(use.any(), (use * right).sum() / total, jnp.nan),
         )
 
-    def _refine_loss(self, variables, key, sample, place):
-        """Start a cell and a bin or so away from a right place and regress the way there."""
-        key_which, key_cell, key_bin = jax.random.split(key, 3)
+    def _refine_losses(self, variables, key, state, match, layout):
+        """Hold every unplaced object over its goal as it fits and a quarter turned, a little off: which fits, and how far off are they?"""
         model, spec = self.model, self.spec
-        which = jax.random.categorical(key_which, jnp.where(sample.valid, 0.0, -1e9))
-        cell = sample.cells[which] + jax.random.randint(key_cell, (2,), -1, 2)
-        cell = jnp.clip(cell, 0, jnp.array([spec.rows - 1, spec.cols - 1]))
-        turn = sample.bins[which] + jax.random.randint(key_bin, (), -1, 2)
-        target = types.cell_from_world(spec, sample.place.xy[which]) - (cell + 0.5)
-        yaw = sample.place.yaw[which] * (model.rotations / (2 * math.pi)) - turn
-        yaw = jnp.mod(yaw + model.rotations / 2, model.rotations) - model.rotations / 2
-        target = jnp.append(target, yaw)
-        guess = jnp.asarray(model.apply(variables, place, jnp.mod(turn, model.rotations), cell, method="refine"))
-        use = sample.valid.any()
-        error = jnp.linalg.norm(guess[:2] - target[:2]) * spec.cell
-        return jnp.where(use, losses.huber(guess - target).sum(), 0.0), jnp.where(use, error, jnp.nan)
+        bins = model.rotations / (2 * math.pi)
+        cells = losses.pick_valid(state, spec=spec)
+        which = jnp.tile(jnp.arange(cells.shape[0]), REFINE_DRAWS)
+        keys = jax.random.split(key, which.shape[0])
+
+        def one(key, index):
+            valid = cells[index]
+            key_pick, key_cell, key_turn, key_quarter = jax.random.split(key, 4)
+            flat = jax.random.categorical(key_pick, jnp.where(valid.ravel(), 0.0, -1e9))
+            pick = jnp.stack([flat // spec.cols, flat % spec.cols]).astype(jnp.int32)
+            label = losses.quarter_label(state, index, types.world_from_index(spec, pick))
+            pair = jnp.mod(jax.random.randint(key_quarter, (), 0, 4) + jnp.arange(2), 4)
+            label = jax.tree.map(lambda leaf: leaf[pair], label)
+            start = types.index_from_world(spec, label.xy) + jax.random.randint(key_cell, (2, 2), -1, 2)
+            start = jnp.clip(start, 0, jnp.array([spec.rows - 1, spec.cols - 1]))
+            turn_error = jax.random.uniform(key_turn, (2,), minval=-1.0, maxval=1.0)
+            target = model.apply(variables, match, pick, method="target")
+            offset, fit = self._refine(variables, layout, target, pick, start, label.yaw * bins + turn_error)
+            wanted = jnp.concatenate([types.cell_from_world(spec, label.xy) - (start + 0.5), -turn_error[:, None]], axis=-1)
+            use = valid.any() & ~state.placed[index]
+            misfit = jnp.where(label.valid, 0.0, jnp.abs(state.size[index, 0] - state.size[index, 1])) / goal_aware.MISFIT
+            fit_loss = losses.masked_cross_entropy(FIT_SCALE * fit, label.valid) + losses.huber(fit + misfit).mean() / 2
+            error = jnp.linalg.norm(offset[:, :2] - wanted[:, :2], axis=-1).mean() * spec.cell
+            told = use & ~label.valid.all()  # a square fits either way: nothing to tell
+            return use, told, losses.huber(offset - wanted).sum(-1).mean(), fit_loss, error, label.valid[fit.argmax()]
+
+        use, told, offset_loss, fit_loss, error, right = jax.vmap(one)(keys, which)
+
+        def mean(values, where, empty):
+            return jnp.where(where.any(), jnp.where(where, values, 0.0).sum() / jnp.maximum(where.sum(), 1), empty)
+
+        metrics = {"refine_error": mean(error, use, jnp.nan), "fit_right": mean(right, told, jnp.nan)}
+        return mean(offset_loss, use, 0.0), mean(fit_loss, told, 0.0), metrics
+
+    def _refine(self, variables, layout, target, pick, cells, turns):
+        """Refine H guesses, `cells` `[H, 2]` and `turns` `[H]`: offsets `[H, 3]` and how well they fit `[H]`."""
+        return jax.vmap(lambda cell, turn: self.model.apply(variables, layout, target, pick, cell, turn, method="refine"))(cells, turns)
+
+    def _guesses(self, logits):
+        """Give the best place, and the best places near it that are turned by one to three quarters: cells `[4, 2]` and bins `[4]`."""
+        rotations, rows, cols = logits.shape
+        turn, row, col = argmax_index(logits)
+        away = jnp.maximum(jnp.abs(jnp.arange(rows) - row)[:, None], jnp.abs(jnp.arange(cols) - col)[None])
+        near = jnp.where(away * self.spec.cell <= QUARTER_NEAR, 0.0, -1e9)
+
+        def one(quarter):
+            turns = jnp.mod(turn + jnp.round(quarter * rotations / 4).astype(jnp.int32) + jnp.arange(-1, 2), rotations)
+            which, row, col = argmax_index(logits[turns] + near)
+            return jnp.stack([row, col]), turns[which]
+
+        cells, turns = jax.vmap(one)(jnp.arange(1, 4))
+        return jnp.concatenate([jnp.stack([row, col])[None], cells]), jnp.append(turn, turns)
 
     def act(self, params, current: types.TopDownMap, goal: types.TopDownMap) -> tuple[types.PickPlace, Heatmaps]:
-        """Choose an action: the best pick, its best place, refined below the cell and the bin."""
+        """Choose an action: the best pick, its best place or that one's quarter turn that fits better, refined below cell and bin."""
         variables, model, spec = {"params": params}, self.model, self.spec
-        match = model.apply(variables, current, goal, method="match")
+        match, layout = self._look(variables, current, goal)
         pick = jnp.stack(argmax_index(match.pick))
-        place = model.apply(variables, current, goal, match, pick, method="place")
-        turn, row, col = argmax_index(place.logits)
-        cell = jnp.stack([row, col])
-        offset = jnp.zeros(3)
+        target = model.apply(variables, match, pick, method="target")
+        place = model.apply(variables, layout, target, pick, method="place")
+        cells, turns = self._guesses(place.logits)
+        cell, turn = cells[0] + 0.5, turns[0].astype(jnp.float32)
         if self.refine:
-            offset = jnp.clip(model.apply(variables, place, turn, cell, method="refine"), -2.0, 2.0)
-        xy = types.world_from_cell(spec, jnp.clip(cell + 0.5 + offset[:2], 0.0, jnp.array([spec.rows, spec.cols])))
-        yaw = (turn + offset[2]) * (2 * math.pi / model.rotations)
-        return _to_action(spec, current, pick, xy, yaw), Heatmaps(match.pick, place.logits)
+            limit = jnp.array([spec.rows, spec.cols])
+            at, turns, fit = cells + 0.5, turns.astype(jnp.float32), jnp.zeros(4)
+            for _ in range(REFINEMENTS):
+                start = jnp.clip(jnp.floor(at).astype(jnp.int32), 0, limit - 1)
+                offset, fit = self._refine(variables, layout, target, pick, start, turns)
+                offset = jnp.clip(offset, -2.0, 2.0)
+                at, turns = jnp.clip(start + 0.5 + offset[:, :2], 0.0, limit), turns + offset[:, 2]
+            best = fit.argmax()  # the first, the best place, where none fits better
+            cell, turn = at[best], turns[best]
+        return _to_action(spec, current, pick, types.world_from_cell(spec, cell), turn * (2 * math.pi / model.rotations)), Heatmaps(
+            match.pick, place.logits
+        )
 
 
 @dataclasses.dataclass(frozen=True)

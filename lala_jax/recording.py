@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import pathlib
 from collections.abc import Mapping
 from typing import Any
@@ -13,6 +14,7 @@ from lala_jax import build, dataset, rollout
 from lala_jax.sim.tasks import base
 
 SHARD = 10  # demonstrations written at a time
+PATIENCE = 8.0  # further actions granted for each spoiled one that is expected
 MIN_SCORE = 99.0  # a demonstration below is not kept
 
 
@@ -37,7 +39,7 @@ def collect(config: Mapping[str, Any], *, quiet: bool = False) -> pathlib.Path:
         while kept < wanted:
             seeds = build.split_seeds("train", place, min(SHARD, wanted - kept))
             place += len(seeds)
-            demos = demonstrate(task, seeds, threads=config["data"]["threads"])
+            demos = demonstrate(task, seeds, threads=config["data"]["threads"], mistakes=build.mistakes(config))
             if demos:
                 dataset.append(directory, demos, **identity)
             kept += len(demos)
@@ -45,8 +47,8 @@ def collect(config: Mapping[str, Any], *, quiet: bool = False) -> pathlib.Path:
     return directory
 
 
-def demonstrate(task: base.Task, seeds: list[int], *, threads: int) -> list:
-    """Let the oracle solve the scenes of `seeds` and give the demonstrations that reached the goal.
+def demonstrate(task: base.Task, seeds: list[int], *, threads: int, mistakes: float = 0.0) -> list:
+    """Let the oracle solve the scenes of `seeds`, a share `mistakes` of its actions spoiled; give the demonstrations that reached the goal.
 
     Seeds whose scene has no free pose are passed over.
     """
@@ -59,5 +61,7 @@ def demonstrate(task: base.Task, seeds: list[int], *, threads: int) -> list:
         usable.append(seed)
     if not usable:
         return []
-    episodes = rollout.run(task, scenes, usable, rollout.oracle_agent(task, scenes, usable), threads=threads)
+    agent = rollout.erring_agent(task, scenes, usable, share=mistakes)
+    budget = math.ceil((task.max_actions or task.default_max_actions()) * (1.0 + PATIENCE * mistakes))
+    episodes = rollout.run(task, scenes, usable, agent, threads=threads, max_actions=budget)
     return [episode.demo() for episode in episodes if episode.score > MIN_SCORE and np.isfinite(episode.poses).all()]

@@ -10,7 +10,7 @@ import numpy as np
 
 from lala_jax import types
 from lala_jax.perception import transforms
-from lala_jax.sim import oracle, physics
+from lala_jax.sim import mistakes, oracle, physics
 from lala_jax.sim.tasks import base
 
 # Given the indices of the running episodes and their object poses [E, N, 7], an action for each; None gives the episode up.
@@ -34,8 +34,8 @@ class Episode:
 
     @property
     def score(self) -> float:
-        """Give the share of placed objects at the end, 0..100."""
-        return 100.0 * float(self.placed[-1].mean())
+        """Give the share of wanted objects that are placed at the end, 0..100."""
+        return 100.0 * float(self.placed[-1][oracle.wanted(self.scene)].mean())
 
     @property
     def complete(self) -> bool:
@@ -125,6 +125,16 @@ def oracle_agent(task: base.Task, scenes: Sequence[types.Scene], seeds: Sequence
 
     def agent(indices, poses):
         return [choose(task, scenes[i], pose, rngs[i]) for i, pose in zip(indices, poses, strict=True)]
+
+    return agent
+
+
+def erring_agent(task: base.Task, scenes: Sequence[types.Scene], seeds: Sequence[int], *, share: float) -> Agent:
+    """Make the oracle an agent that spoils a `share` of its actions."""
+    rngs = [(np.random.default_rng([seed, 1]), np.random.default_rng([seed, 2])) for seed in seeds]
+
+    def agent(indices, poses):
+        return [mistakes.act(task, scenes[i], pose, *rngs[i], share=share) for i, pose in zip(indices, poses, strict=True)]
 
     return agent
 

@@ -17,9 +17,17 @@ AGENTS = ("policy", "oracle", "blind")
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def observe_batch(observer: observe.Observer, scenes: types.Scene, poses: jax.Array, key: jax.Array) -> types.TopDownMap:
+def observe_batch(
+    observer: observe.Observer, scenes: types.Scene, poses: jax.Array, key: jax.Array, rig: observe.Rig | None
+) -> types.TopDownMap:
     """Render and fuse B scenes (leaves `[B, ...]`) with their objects at `poses` `[B, N, 7]`."""
-    return observer.maps(scenes.size, scenes.color, scenes.base, poses, key=key)
+    return observer.maps(scenes.size, scenes.color, scenes.base, poses, key=key, rig=rig)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def mount_batch(observer: observe.Observer, key: jax.Array, scenes: types.Scene) -> observe.Rig:
+    """Put up the cameras of B episodes at their start."""
+    return observer.mount(key, scenes.size, scenes.color, scenes.base, scenes.start)
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -46,12 +54,14 @@ class PolicyAgent:
         self.keep = keep  # the heat maps of so many episodes, the first ones, are kept
         padded = [*scenes, *[scenes[0]] * (parallel - len(scenes))]
         self._scenes = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *padded)
+        self._key, key = jax.random.split(self._key)
+        self.rig = mount_batch(observer, key, self._scenes) if observer.moves else None
         self._goal = self._look(self._scenes.goal)
         self.seen: list[policy.Heatmaps] = []  # per step, leaves [keep, ...]
 
     def _look(self, poses):
         self._key, key = jax.random.split(self._key)
-        return observe_batch(self._observer, self._scenes, poses, key)
+        return observe_batch(self._observer, self._scenes, poses, key, self.rig)
 
     def __call__(self, indices: Sequence[int], poses: np.ndarray) -> list[types.PickPlace]:
         every = np.array(self._scenes.start)

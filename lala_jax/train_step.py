@@ -11,6 +11,7 @@ import numpy as np
 import optax
 
 from lala_jax import augment, observe, policy, state, types
+from lala_jax.perception import topdown
 from lala_jax.sim.tasks import base
 
 
@@ -24,12 +25,13 @@ class Recipe:
     batch_size: int
     recolor: bool = True
     rigid: bool = True
+    sensors: augment.Sensors = augment.Sensors()
     average_decay: float = 0.998
 
 
 def palette(task: base.Task) -> np.ndarray:
-    """Give the colours `[P, 3]` in 0..1 that the task draws from."""
-    return np.array([base.COLORS[name] for name in base.PALETTES[task.colors]], np.float32) / 255.0
+    """Give the colours `[P, 3]` in 0..1 that the task draws from, the paper's for a task of any colours."""
+    return np.asarray(base.palette(task.colors if task.colors in base.PALETTES else "paper"), np.float32)
 
 
 def augmented(recipe: Recipe, key: jax.Array, example: types.State) -> types.State:
@@ -44,11 +46,17 @@ def augmented(recipe: Recipe, key: jax.Array, example: types.State) -> types.Sta
 
 
 def observations(recipe: Recipe, key: jax.Array, examples: types.State) -> tuple[types.TopDownMap, types.TopDownMap]:
-    """Render and fuse B examples and their goals: maps with leaves `[B, ...]`."""
+    """Render and fuse B examples and their goals, seen with the same errors of the cameras: maps with leaves `[B, ...]`."""
     size = examples.color.shape[0]
     facts, color, stand = (jnp.concatenate([x, x]) for x in (examples.size, examples.color, examples.base))
     poses = jnp.concatenate([examples.poses, examples.goal])
-    maps = recipe.observer.maps(facts, color, stand, poses, key=key)
+    observer, (key_noise, key_errors) = recipe.observer, jax.random.split(key)
+    views = observer.look(facts, color, stand, poses, key=key_noise)
+    if recipe.sensors:
+        pair = jax.random.split(key_errors, size)
+        keys = jnp.concatenate([pair, pair]), jax.random.split(key_noise, 2 * size)
+        views = jax.vmap(lambda *one: augment.sensors(*one, recipe.sensors, disparity=observer.disparity))(*keys, views)
+    maps = topdown.from_views_batch(views, spec=observer.spec)
     return jax.tree.map(lambda x: x[:size], maps), jax.tree.map(lambda x: x[size:], maps)
 
 

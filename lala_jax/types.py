@@ -114,7 +114,9 @@ class TopDownMap:
 
     features: jax.Array  # [rows, cols, slices, C] mean over the points in the voxel, 0 where none fell
     count: jax.Array  # [rows, cols, slices] float32, number of points that fell into the voxel
+    offset: jax.Array  # [rows, cols, slices, 2] mean (row, col) of these points less the cell's centre, in cells; 0 where none fell
     height: jax.Array  # [rows, cols] metres above z_min of the highest point seen, 0 where none fell
+    skin: jax.Array  # [rows, cols, 2] mean (row, col), likewise, of the points just under the highest: how far the top face fills the cell
 
 
 @struct.dataclass

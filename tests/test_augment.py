@@ -9,8 +9,14 @@ from test_losses import SPEC, on_device, state_of
 from lala_jax import augment, losses, train_step, types
 from lala_jax.perception import transforms
 from lala_jax.sim import tasks
+from lala_jax.sim.tasks import base
 
 PALETTE = jnp.asarray(train_step.palette(tasks.get("pallet")))
+
+
+def closest(colors):
+    """The distance of the closest two colours, by a loop."""
+    return min(float(np.linalg.norm(a - b)) for i, a in enumerate(np.asarray(colors)) for b in np.asarray(colors)[:i])
 
 
 def test_recolor_without_noise_deals_the_palette():
@@ -23,15 +29,44 @@ def test_recolor_without_noise_deals_the_palette():
 
 
 def test_recolor_keeps_colours_apart_and_in_range():
-    """Mirrored and permuted channels keep every distance between two colours."""
-    state = state_of("pallet")
-    gaps = np.linalg.norm(np.asarray(PALETTE)[:, None] - np.asarray(PALETTE)[None], axis=-1)
-    closest = gaps[~np.eye(len(gaps), dtype=bool)].min()
-    for seed in range(10):
-        color = np.asarray(augment.recolor(jax.random.key(seed), on_device(state), palette=PALETTE, jitter=0.0, mix=1.0).color)
-        apart = np.linalg.norm(color[:, None] - color[None], axis=-1)[~np.eye(len(color), dtype=bool)]
-        assert apart.min() > closest - 1e-5
-        assert color.min() >= 0 and color.max() <= 1
+    """Colours drawn anywhere are as far apart as the closest two of the palette, or as told."""
+    state, drawn = state_of("pallet"), jax.jit(augment.recolor, static_argnames=("jitter", "mix"))
+    assert base.APART == pytest.approx(closest(PALETTE))
+    colors = []
+    for seed in range(40):
+        for apart in (None, 0.3):
+            color = np.asarray(drawn(jax.random.key(seed), on_device(state), palette=PALETTE, jitter=0.0, mix=1.0, apart=apart).color)
+            assert closest(color) > (apart or base.APART) - 1e-5
+            assert color.min() >= 0 and color.max() <= 1
+        colors.append(color)
+    assert np.abs(np.mean(colors, (0, 1)) - 0.5).max() < 0.08
+    assert np.min(colors, (0, 1)).max() < 0.05 and np.max(colors, (0, 1)).min() > 0.95
+
+
+def test_recolor_mixes_palette_and_other_colours():
+    state, drawn = state_of("pallet"), jax.jit(augment.recolor, static_argnames=("jitter", "mix"))
+    known = 0
+    for seed in range(40):
+        color = np.asarray(drawn(jax.random.key(seed), on_device(state), palette=PALETTE, jitter=0.0, mix=0.5).color)
+        near = np.linalg.norm(color[:, None] - np.asarray(PALETTE), axis=-1).min(-1) < 1e-6
+        assert near.all() or not near.any()
+        known += int(near.all())
+    assert 8 < known < 32
+
+
+@pytest.mark.parametrize("apart", [0.2, 0.5, 5.0])
+def test_spread_equals_a_loop(apart):
+    points = np.random.default_rng(0).random((20, 3)).astype(np.float32)
+    chosen = []
+    for _ in range(8):
+        distance = [min((np.linalg.norm(point - other) for other in chosen), default=np.inf) for point in points]
+        chosen.append(next((point for point, far in zip(points, distance, strict=True) if far >= apart), points[np.argmax(distance)]))
+    np.testing.assert_array_equal(augment.spread(jnp.asarray(points), 8, apart=apart), chosen)
+
+
+def test_recolor_refuses_more_objects_than_colours():
+    with pytest.raises(ValueError, match="8 objects cannot be recoloured from a palette of 7"):
+        augment.recolor(jax.random.key(0), on_device(state_of("pallet")), palette=PALETTE[:7])
 
 
 @pytest.mark.parametrize("name", ["tower", "pallet"])

@@ -1,10 +1,11 @@
 """Closed loop with the real primitive: the oracle solves, the blind agent does not, failures are counted and named."""
 
+import jax
 import numpy as np
 import pytest
 
-from lala_jax import recording, rollout, types
-from lala_jax.sim import tasks
+from lala_jax import build, dataset, defaults, options, recording, rollout, types
+from lala_jax.sim import oracle, tasks
 
 
 def run(task, seeds, agent=None, **options):
@@ -39,6 +40,65 @@ def test_threads_change_nothing():
     one, two = (recording.demonstrate(task, [0, 2, 4], threads=threads) for threads in (1, 2))
     for a, b in zip(one, two, strict=True):
         np.testing.assert_array_equal(a.poses, b.poses)
+
+
+def same(a, b):
+    return all(x.tobytes() == y.tobytes() for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+
+
+def test_without_mistakes_demonstrations_are_the_oracles():
+    task, seeds = tasks.get("tower", num_objects=3), [0, 2, 4]
+    demos = recording.demonstrate(task, seeds, threads=2)
+    assert len(demos) == 3 and all(same(demo, episode.demo()) for demo, episode in zip(demos, run(task, seeds), strict=True))
+
+
+def test_spoiled_actions_lengthen_demonstrations_but_teach_nothing():
+    """They reach the goal all the same, and the states they lead to are labelled by the poses alone."""
+    task, seeds = tasks.get("pallet"), [0, 2, 4, 6]
+    one, two = (recording.demonstrate(task, seeds, threads=threads, mistakes=0.3) for threads in (1, 2))
+    assert len(one) >= 2 and all(same(a, b) for a, b in zip(one, two, strict=True))
+    assert sum(len(demo.action.yaw) for demo in one) >= 8 * len(one) + 3
+    for demo in one:
+        assert demo.score == 100 and demo.placed[-1].all()
+        for t, poses in enumerate(demo.poses):
+            np.testing.assert_array_equal(demo.ready[t], oracle.ready(task, demo.scene, poses))
+            np.testing.assert_array_equal(demo.placed[t], oracle.placed(task, demo.scene, poses))
+    foreign = [
+        demo.replace(action=jax.tree.map(lambda leaf: np.full_like(leaf, 9), demo.action)) for demo in one
+    ]  # other actions, same lessons
+    assert same(dataset.stack(one), dataset.stack(foreign))
+
+
+def test_what_is_recorded_is_told_apart_and_older_recordings_still_read():
+    config = defaults.get("", task="tower")
+    assert build.task_options(config) == {"num_objects": 5, "colors": "paper"}
+    config.task.distractors, config.data.mistakes = 2, 0.25
+    assert build.task_options(config) == {"num_objects": 5, "colors": "paper", "distractors": 2, "mistakes": 0.25}
+    assert build.task(config).distractors == 2
+    old = config.to_dict()
+    del old["task"]["distractors"], old["data"]["mistakes"]
+    assert build.task_options(old) == {"num_objects": 5, "colors": "paper"}
+    config.data.mistakes = 1.0
+    with pytest.raises(options.OptionsError, match="data.mistakes must be at least 0 and below 1, got 1.0"):
+        build.task_options(config)
+    config.data.mistakes, config.task.colors = 0.0, "uniform"
+    assert build.task(config).colors == "uniform"
+    config.task.distractors = 20
+    with pytest.raises(options.OptionsError, match="distractors=20"):
+        build.task(config)
+
+
+def test_a_distractor_is_the_wrong_object_and_scores_nothing():
+    task = tasks.get("tower", num_objects=1, distractors=1)
+    scene = task.sample(0)
+    lift = np.array([0, 0, 0.02], np.float32)
+    spot = oracle.parking(task, scene, scene.start, 1, np.random.default_rng(0))[:3]
+    action = types.PickPlace(pick=scene.start[1, :3] + lift, place=np.float32(spot + lift), yaw=np.float32(0))
+    episode = run(task, [0], constant(action), max_actions=1)[0]
+    assert episode.causes == ["wrong object"] and episode.score == 0 and not episode.complete
+    assert np.linalg.norm(episode.poses[1][1, :2] - spot[:2]) < 0.01
+    solved = run(task, [0])[0]
+    assert solved.score == 100 and solved.complete and solved.causes == ["right"]
 
 
 def constant(action):

@@ -7,12 +7,15 @@ Three steps, each dense over the map (see the README's design notes for why):
    logits of a cell are `a(u) + logsumexp_t(b(t) + <E(u), F(t)>)` over goal voxels t: attention between the two maps' tokens.
 2. Place. The picked cell's embedding selects its voxels in the goal; that mask joins the goal map in the key net, and the
    rotated crops about the pick are correlated with the key (Transporter Networks, equation 3).
-3. Refine. The offset from the best cell and bin to the true place is regressed from the two patches laid over each other.
+3. Refine. Guesses that differ by quarter turns are laid over the goal, and a small network says for each how well it fits and how far
+   it is off. A box whose sides differ by millimetres is told from its quarter turn here.
 
 Everything is unbatched: vmap over examples.
 """
 
 from __future__ import annotations
+
+import math
 
 import flax.linen as nn
 import jax
@@ -27,6 +30,8 @@ POOL = 2  # map cells per token cell, each way
 HEIGHT_SCALE = 5.0  # heights enter as metres times this, so that a tower is about 1
 COLOR_MEAN = 0.5
 FLOOR = 0.01  # metres: a goal column lower than this is bare table, nothing belongs there
+FACE = 0.01  # metres: what is as high as the pick, to within this, is the face that was picked
+MISFIT = 0.006  # metres of difference between two sides that count as one in a fit
 SAME = 0.05  # colours (RGB distance, 0..1) closer than this are the same thing, seen with another rounding
 
 
@@ -44,11 +49,26 @@ class Match:
 
 @struct.dataclass
 class Place:
-    """What one pick gives: logits over k rotations of every cell, and what the refinement reads."""
+    """What one pick gives: logits over k rotations of every cell."""
 
     logits: jax.Array  # [k, rows, cols]
-    key_input: jax.Array  # [rows, cols, channels]
-    crops: jax.Array  # [k, crop, crop, channels]
+
+
+@struct.dataclass
+class Layout:
+    """What the place step and the refinement read of both maps, whatever is picked."""
+
+    now: jax.Array  # [rows, cols, 8] the surface now: colour, offset, height, how much of the cell its top face covers; 1
+    goal: jax.Array  # [rows, cols, 8] the surface of the goal, and the height now
+    levels: jax.Array  # [rows, cols, slices, 7] sums over the goal's points: colour, offset, number of points; and whether there are any
+
+
+@struct.dataclass
+class Target:
+    """What in the goal is the picked object."""
+
+    weight: jax.Array  # [R, C, slices] 0..1: how much a voxel of the goal looks like it
+    level: jax.Array  # [slices] shares of the slices it is in
 
 
 class ResidualBlock(nn.Module):
@@ -126,17 +146,19 @@ class QueryNet(nn.Module):
 
 
 class RefineNet(nn.Module):
-    """Regress `(row, col, yaw)` offsets, in cells and bins, from a stack of patches `[crop, crop, channels]`."""
+    """Say of a stack of patches `[crop, crop, channels]` the offset `(row, col, yaw)`, in cells and bins, and a logit of their fit."""
 
     width: int
 
     @nn.compact
     def __call__(self, x):
+        x = nn.relu(nn.Conv(self.width, (3, 3))(x))
         x = nn.relu(nn.Conv(self.width, (5, 5), strides=(2, 2))(x))
         x = nn.relu(nn.Conv(2 * self.width, (3, 3), strides=(2, 2))(x))
         x = nn.relu(nn.Conv(2 * self.width, (3, 3))(x))
         x = nn.relu(nn.Dense(4 * self.width)(x.ravel()))
-        return nn.Dense(3, kernel_init=nn.initializers.normal(1e-3))(x)
+        offset = nn.Dense(3, kernel_init=nn.initializers.normal(1e-3))(x)
+        return offset, nn.Dense(1, kernel_init=nn.initializers.zeros)(x)[0]
 
 
 class GoalAware(nn.Module):
@@ -162,7 +184,7 @@ class GoalAware(nn.Module):
         self.pick_out = nn.Conv(1, (1, 1), kernel_init=nn.initializers.normal(1e-2))
         self.key_net = KeyNet(width=self.fine_width, out=self.channels + 1)
         self.query_net = QueryNet(width=16, out=self.channels)
-        self.refine_net = RefineNet(width=24)
+        self.refine_net = RefineNet(width=32)
         self.temperature = self.param("temperature", nn.initializers.constant(8.0), ())
 
     def match(self, current: types.TopDownMap, goal: types.TopDownMap) -> Match:
@@ -170,7 +192,7 @@ class GoalAware(nn.Module):
         now_color, now_count = _pool(current)
         goal_color, goal_count = _pool(goal)
         now_seen, goal_seen = now_count > 0, goal_count > 0
-        surface = self.voxel(_highest(_voxel_input(now_color, now_count), now_seen)) * self.temperature
+        surface = self.voxel(topdown.highest(_voxel_input(now_color, now_count), now_seen)) * self.temperature
         differs = jnp.linalg.norm(goal_color - now_color, axis=-1) * now_seen
         lacks = (goal_seen & ~now_seen).astype(jnp.float32)
         context = self.trunk(_columns(now_color, now_seen, goal_color, goal_seen, lacks, differs))
@@ -192,47 +214,83 @@ class GoalAware(nn.Module):
         x = nn.relu(self.pick_in(x))
         return self.pick_out(nn.relu(self.pick_mid(x)))[..., 0]
 
-    def place(self, current: types.TopDownMap, goal: types.TopDownMap, match: Match, pick: jax.Array) -> Place:
-        """Say where the object under the cell `pick` `[2]` (row, col) goes, for every rotation and cell."""
-        target = self.target_mask(goal, match, pick)
-        key_input = jnp.concatenate([_surface_input(goal), current.height[..., None] * HEIGHT_SCALE, target], axis=-1)
-        surface = _surface_input(current)
-        above = surface[..., 3:] - surface[pick[0], pick[1], 3]
-        about = jnp.concatenate([surface, above, jnp.ones_like(above)], axis=-1)
-        crops = image.rotate_crop(about, pick + 0.5, self.rotations, self.crop)
-        key = self.key_net(key_input)
-        kernels = self.query_net(crops)
-        scale = (self.crop * self.crop * self.channels) ** -0.5
-        logits = correlation.correlate(key[..., :-1], kernels * scale) + key[None, ..., -1]
-        return Place(logits=logits, key_input=key_input, crops=crops)
+    def layout(self, current: types.TopDownMap, goal: types.TopDownMap) -> Layout:
+        """Arrange both maps for `place` and `refine`."""
+        surface = jnp.concatenate([_surface_input(goal), current.height[..., None] * HEIGHT_SCALE], axis=-1)
+        seen = (goal.count > 0).astype(jnp.float32)[..., None]
+        points = goal.count[..., None]
+        levels = jnp.concatenate([(goal.features[..., :3] - COLOR_MEAN) * points, goal.offset * points, points, seen], axis=-1)
+        on_map = jnp.ones((self.spec.rows, self.spec.cols, 1))
+        return Layout(now=jnp.concatenate([_surface_input(current), on_map], axis=-1), goal=surface, levels=levels)
 
-    def target_mask(self, goal: types.TopDownMap, match: Match, pick: jax.Array) -> jax.Array:
-        """Give `[rows, cols, 2]`: how much of the picked object is in each column of the goal, and its height there.
+    def place(self, layout: Layout, target: Target, pick: jax.Array) -> Place:
+        """Say where the object under the cell `pick` `[2]` (row, col) goes, for every rotation and cell."""
+        around, centre = self._around(layout, pick)
+        crops = image.rotate_crop(around, centre, self.rotations, self.crop)
+        turns = jnp.arange(self.rotations) * (2 * math.pi / self.rotations)
+        weight = jnp.repeat(jnp.repeat(target.weight, POOL, 0), POOL, 1)
+        key = self.key_net(self._picture(layout.goal, layout.levels, weight, target))
+        kernels = self.query_net(_turn_offsets(crops, turns[:, None, None]))
+        scale = (self.crop * self.crop * self.channels) ** -0.5
+        return Place(logits=correlation.correlate(key[..., :-1], kernels * scale) + key[None, ..., -1])
+
+    def target(self, match: Match, pick: jax.Array) -> Target:
+        """Find the object under the cell `pick` `[2]` in the goal.
 
         No gradient flows through it: the matching losses teach the embeddings.
         """
         picked = match.current[pick[0] // POOL, pick[1] // POOL]
         score = jnp.where(match.token_valid, match.token_embedding @ picked, -1e9)
-        share = jax.lax.stop_gradient(jnp.exp(score - score.max()))
+        share = jax.lax.stop_gradient(jnp.exp(score - score.max())) * match.token_valid
         grid = (self.spec.rows // POOL, self.spec.cols // POOL, self.spec.slices)
-        at = (match.token[:, 0], match.token[:, 1], match.token[:, 2])
-        weight = jnp.zeros(grid).at[at].set(share * match.token_valid)
-        fine = jnp.repeat(jnp.repeat(weight, POOL, 0), POOL, 1) * (goal.count > 0)
-        height = (jnp.arange(self.spec.slices) + 0.5) * self.spec.slice_height * HEIGHT_SCALE
-        return jnp.stack([fine.max(-1), (fine * height).max(-1)], axis=-1)
+        weight = jnp.zeros(grid).at[match.token[:, 0], match.token[:, 1], match.token[:, 2]].set(share)
+        level = weight.max((0, 1))
+        return Target(weight=weight, level=level / jnp.maximum(level.sum(), 1e-9))
 
-    def refine(self, place: Place, bin_index: jax.Array, cell: jax.Array) -> jax.Array:
-        """Regress the offset `[3]` (rows, cols, bins) from the centre of a cell `[2]` and a bin to the true place."""
-        before, after = self.crop // 2, self.crop - self.crop // 2
-        padded = jnp.pad(place.key_input, ((before, after), (before, after), (0, 0)))
-        patch = jax.lax.dynamic_slice(padded, (cell[0], cell[1], 0), (self.crop, self.crop, padded.shape[-1]))
-        return self.refine_net(jnp.concatenate([patch, place.crops[bin_index]], axis=-1))
+    def refine(self, layout: Layout, target: Target, pick: jax.Array, cell: jax.Array, turn: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Lay what hangs from `pick` `[2]`, turned by `turn` (bins, any fraction), over the cell `[2]` of the goal.
+
+        Gives the offset `[3]` (rows, cols, bins) from there to the true place, and how well it fits: minus the metres by which
+        its sides disagree with the goal's, over `MISFIT`.
+        """
+        rows, cols = (cell[axis] - self.crop // 2 + jnp.arange(self.crop) for axis in (0, 1))
+        weight = _window(target.weight, rows // POOL, cols // POOL)
+        patch = self._picture(_window(layout.goal, rows, cols), _window(layout.levels, rows, cols), weight, target)
+        around, centre = self._around(layout, pick)
+        yaw = turn * (2 * math.pi / self.rotations)
+        crop = _turn_offsets(image.turned_crop(around, centre, yaw, self.crop), yaw)
+        return self.refine_net(jnp.concatenate([patch, crop, patch[..., -1:] - crop[..., -1:]], axis=-1))
+
+    def _around(self, layout, pick):
+        """Give the part of the present `[n, n, 10]` that any turn of the crop about `pick` shows, and the pick's place in it.
+
+        Channels: the surface, 1 on the map, how high it is over the pick, and the share of the cell that the picked face covers.
+        """
+        half = math.ceil(self.crop * math.sqrt(0.5)) + 1
+        around = _window(layout.now, *(pick[axis] - half + jnp.arange(2 * half + 1) for axis in (0, 1)))
+        above = (around[..., 5:6] - layout.now[pick[0], pick[1], 5]) * around[..., 7:8]
+        face = around[..., 6:7] * (jnp.abs(above) < FACE * HEIGHT_SCALE)
+        return jnp.concatenate([around, above, face], axis=-1), (half + 0.5, half + 0.5)
+
+    def _picture(self, goal, levels, weight, target):
+        """Show the picked object's place in the goal, `[r, c, 17]`, for layers `[r, c, ...]` of the layout and weights `[r, c, slices]`.
+
+        Channels: the goal's surface and the height now; where the object is and how high; the goal at its level: colour, offset,
+        how much of a column is seen; the share of the cell that its top face covers.
+        """
+        fine = weight * levels[..., -1]
+        height = (jnp.arange(self.spec.slices) + 0.5) * self.spec.slice_height * HEIGHT_SCALE
+        level = jnp.einsum("rcsf,s->rcf", levels, target.level)
+        mean = level[..., :5] / jnp.maximum(level[..., 5:6], 1e-6)
+        face = topdown.highest(fine[..., None], levels[..., -1] > 0) * goal[..., 6:7]
+        return jnp.concatenate([goal, fine.max(-1)[..., None], (fine * height).max(-1)[..., None], mean, level[..., 6:], face], axis=-1)
 
     def __call__(self, current: types.TopDownMap, goal: types.TopDownMap, pick: jax.Array):
-        """Run every part once (to make the parameters): `(Match, Place, offset)`."""
+        """Run every part once (to make the parameters): `(Match, Place, (offset, fit))`."""
         match = self.match(current, goal)
-        place = self.place(current, goal, match, pick)
-        return match, place, self.refine(place, jnp.int32(0), pick)
+        layout = self.layout(current, goal)
+        target = self.target(match, pick)
+        return match, self.place(layout, target, pick), self.refine(layout, target, pick, pick, jnp.float32(0))
 
 
 def _pool(topdown_map):
@@ -271,13 +329,6 @@ def _columns(now_color, now_seen, goal_color, goal_seen, lacks, differs):
     return jnp.concatenate(flat, axis=-1)
 
 
-def _highest(values, seen):
-    """Take each column's value in its highest occupied slice: `[R, C, slices, e]` to `[R, C, e]`."""
-    slices = seen.shape[-1]
-    top = slices - 1 - jnp.argmax(seen[..., ::-1], axis=-1)
-    return jnp.take_along_axis(values, top[..., None, None], axis=2)[:, :, 0]
-
-
 def _top_tokens(priority, tokens):
     """Give the indices `[M, 3]` of the voxels of highest priority, and which of them are above zero."""
     value, flat = jax.lax.top_k(priority.ravel(), min(tokens, priority.size))
@@ -285,9 +336,24 @@ def _top_tokens(priority, tokens):
 
 
 def _surface_input(topdown_map):
-    """Give the picture from above, `[rows, cols, 4]`: centred colour and scaled height."""
-    top = topdown.max_height(topdown_map)
-    return jnp.concatenate([top[..., :3] - COLOR_MEAN, top[..., -1:] * HEIGHT_SCALE], axis=-1)
+    """Give the picture from above, `[rows, cols, 7]`: centred colour, offset, scaled height, share of the cell that the top face covers."""
+    top = topdown.highest(topdown_map.features[..., :3] - COLOR_MEAN, topdown_map.count > 0)
+    covered = jnp.prod(1 - 2 * jnp.abs(topdown_map.skin), axis=-1, keepdims=True)
+    return jnp.concatenate([top, topdown_map.skin, topdown_map.height[..., None] * HEIGHT_SCALE, covered], axis=-1)
+
+
+def _window(values, rows, cols):
+    """Read the cells of some rows `[r]` and columns `[c]` of `[rows, cols, ...]`, zero outside: `[r, c, ...]`."""
+    inside = ((rows >= 0) & (rows < values.shape[0]))[:, None] & ((cols >= 0) & (cols < values.shape[1]))[None]
+    read = values[jnp.clip(rows, 0, values.shape[0] - 1)[:, None], jnp.clip(cols, 0, values.shape[1] - 1)[None]]
+    return jnp.where(inside.reshape(inside.shape + (1,) * (values.ndim - 2)), read, 0.0)
+
+
+def _turn_offsets(crops, yaw):
+    """Turn the offsets (row, col) of the points in a turned crop `[..., crop, crop, 8]` as well, by `yaw` `[...]` radians."""
+    row, col = crops[..., 3], crops[..., 4]
+    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
+    return crops.at[..., 3].set(cos * row + sin * col).at[..., 4].set(cos * col - sin * row)
 
 
 def _upsample(x, factor):

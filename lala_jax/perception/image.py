@@ -41,6 +41,15 @@ def rotation_offsets(yaw_bins: int, size: int) -> np.ndarray:
     return np.stack([cos * y - sin * x, cos * x + sin * y], axis=-1)
 
 
+def turned_crop(
+    image: Float[Array, "rows cols c"], center: Num[Array | np.ndarray, " 2"] | Sequence, yaw: Float[Array, ""], size: int
+) -> Float[Array, "size size c"]:
+    """Give one crop of `rotate_crop`, for any `yaw` in radians."""
+    y, x = np.meshgrid(np.arange(size) - size // 2, np.arange(size) - size // 2, indexing="ij")
+    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
+    return sample(image, jnp.stack([cos * y - sin * x, cos * x + sin * y], axis=-1) + jnp.asarray(center, jnp.float32))
+
+
 def rotate_crop(
     image: Float[Array, "rows cols c"], center: Num[Array | np.ndarray, " 2"] | Sequence, yaw_bins: int, size: int
 ) -> Float[Array, "k size size c"]:

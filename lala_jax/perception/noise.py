@@ -1,10 +1,13 @@
-"""A depth camera's errors: axial noise, disparity steps, and holes at edges. Pure; the key comes first."""
+"""What real cameras do wrong: noisy depth with holes, cameras that are not where they are thought to be. Pure; the key comes first."""
 
 from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
+
+from lala_jax import types
+from lala_jax.perception import transforms
 
 
 def depth_noise(
@@ -37,6 +40,27 @@ def depth_noise(
     lost = edges(depth, jump=edge_jump) & jax.random.bernoulli(key_edge, edge_dropout, depth.shape)
     lost |= jax.random.bernoulli(key_hole, dropout, depth.shape)
     return jnp.where(hit & ~lost, noisy, 0.0)
+
+
+def move_cameras(key: jax.Array, camera: types.Camera, *, shift: float, turn: float) -> types.Camera:
+    """Move each camera (leaves `[V, ...]`) by up to `shift` metres and turn it about itself by up to `turn` radians.
+
+    Directions and axes are uniform, lengths and angles uniform from zero; one draw a camera.
+    """
+    key_shift, key_axis, key_length = jax.random.split(key, 3)
+    count = camera.world_from_cam.shape[0]
+    length = jax.random.uniform(key_length, (2, count, 1))
+    step = _directions(key_shift, count) * length[0] * shift
+    half = length[1] * turn / 2
+    quat = jnp.concatenate([jnp.cos(half), jnp.sin(half) * _directions(key_axis, count)], axis=-1)
+    rotation = jnp.matmul(transforms.matrix_from_quat(quat), camera.world_from_cam[:, :3, :3], precision=jax.lax.Precision.HIGHEST)
+    moved = camera.world_from_cam.at[:, :3, :3].set(rotation).at[:, :3, 3].add(step)
+    return camera.replace(world_from_cam=moved)
+
+
+def _directions(key, count):
+    vectors = jax.random.normal(key, (count, 3))
+    return vectors / jnp.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 def edges(depth: Float[Array, "... height width"], *, jump: float) -> Bool[Array, "... height width"]:

@@ -18,8 +18,12 @@ def fuse(
     spec: types.MapSpec,
     floor_margin: float = 0.01,
     surface_margin: float = 0.001,
+    skin: float = 0.005,
 ) -> types.TopDownMap:
-    """Average the features of the points in each voxel, and keep each cell's highest point.
+    """Average the features and the place of the points in each voxel, and keep each cell's highest point.
+
+    The mean place within the cell (as in PointPillars, CVPR 2019) says where an edge runs to a fraction of a cell; that of the
+    points within `skin` metres of the cell's highest one does so for a top face, without the points of the side under it.
 
     Points outside the map, at or above `z_max`, or more than `floor_margin` metres below `z_min` are dropped; those within
     `floor_margin` below count as the floor (slice 0, height 0). `surface_margin` metres are taken off z before slicing:
@@ -28,13 +32,23 @@ def fuse(
     The result does not depend on the order of points, up to float32 rounding of the sums.
     """
     voxel, cell, height = _locate(points, valid, spec, floor_margin, surface_margin)
-    rows = jnp.concatenate([features.astype(jnp.float32), jnp.ones((len(features), 1))], axis=-1)
+    at = types.cell_from_world(spec, points[:, :2])
+    within = at - jnp.floor(at) - 0.5
+    rows = jnp.concatenate([features.astype(jnp.float32), within, jnp.ones((len(features), 1))], axis=-1)
     total = jnp.zeros((spec.rows * spec.cols * spec.slices, rows.shape[1])).at[voxel].add(rows, **_DROP)
     top = jnp.zeros(spec.rows * spec.cols, points.dtype).at[cell].max(height, **_DROP)
+    high = jnp.where(height > top.at[cell].get(mode="fill", fill_value=jnp.inf) - skin, cell, spec.rows * spec.cols)
+    face = jnp.concatenate([within, jnp.ones_like(within[:, :1])], axis=-1)
+    face = jnp.zeros((spec.rows * spec.cols, 3)).at[high].add(face, **_DROP)
     count = total[:, -1:]
-    mean = total[:, :-1] / jnp.maximum(count, 1)
-    grid = (spec.rows, spec.cols, spec.slices)
-    return types.TopDownMap(features=mean.reshape(*grid, features.shape[1]), count=count.reshape(grid), height=top.reshape(grid[:2]))
+    mean = (total[:, :-1] / jnp.maximum(count, 1)).reshape(spec.rows, spec.cols, spec.slices, -1)
+    return types.TopDownMap(
+        features=mean[..., :-2],
+        count=count.reshape(mean.shape[:3]),
+        offset=mean[..., -2:],
+        height=top.reshape(mean.shape[:2]),
+        skin=(face[:, :2] / jnp.maximum(face[:, 2:], 1)).reshape(*mean.shape[:2], 2),
+    )
 
 
 # Dropping by an index past the end costs nothing, where a spare row would collect three quarters of all writes.
@@ -100,8 +114,10 @@ def from_views_batch(
 
 def max_height(topdown: types.TopDownMap) -> Float[Array, "rows cols channels"]:
     """Give what is seen from above, `[rows, cols, C + 1]`: each cell's features in its highest seen slice, then its height in metres."""
-    seen = topdown.count > 0
-    slices = seen.shape[-1]
-    highest = slices - 1 - jnp.argmax(seen[..., ::-1], axis=-1)
-    top = jnp.take_along_axis(topdown.features, highest[..., None, None], axis=-2)[..., 0, :]
-    return jnp.concatenate([top, topdown.height[..., None]], axis=-1)
+    return jnp.concatenate([highest(topdown.features, topdown.count > 0), topdown.height[..., None]], axis=-1)
+
+
+def highest(values: Float[Array, "rows cols slices c"], seen: Bool[Array, "rows cols slices"]) -> Float[Array, "rows cols c"]:
+    """Take each column's value in its highest occupied slice."""
+    top = seen.shape[-1] - 1 - jnp.argmax(seen[..., ::-1], axis=-1)
+    return jnp.take_along_axis(values, top[..., None, None], axis=2)[:, :, 0]

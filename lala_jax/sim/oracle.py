@@ -26,24 +26,32 @@ def _boxes(scene: types.Scene, poses: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return np.asarray(poses, float), np.asarray(scene.size, float)
 
 
+def wanted(scene: types.Scene) -> np.ndarray:
+    """Say which objects the goal shows; the others are distractors, their goal poses are under the table."""
+    return np.asarray(scene.goal)[:, 2] >= 0.0
+
+
 def placed(task: base.Task, scene: types.Scene, poses: np.ndarray) -> np.ndarray:
-    """Say which objects are at their goal pose: planar, height and yaw errors (modulo symmetry) within tolerance, and upright."""
+    """Say which objects are at their goal pose: planar, height and yaw errors (modulo symmetry) within tolerance, and upright.
+
+    A distractor counts as placed wherever it is: nothing is left to do with it.
+    """
     del task
     poses, goal = np.asarray(poses, float), np.asarray(scene.goal, float)
     turn = transforms.wrap_angle(geometry.yaw(poses) - geometry.yaw(goal), np.asarray(scene.symmetry, float))
     near = np.linalg.norm(poses[:, :2] - goal[:, :2], axis=-1) < PLANAR
     level = np.abs(poses[:, 2] - goal[:, 2]) < HEIGHT
     upright = geometry.matrix(poses)[:, 2, 2] > np.cos(TURN)
-    return near & level & upright & (np.abs(turn) < TURN)
+    return (near & level & upright & (np.abs(turn) < TURN)) | ~wanted(scene)
 
 
 def score(task: base.Task, scene: types.Scene, poses: np.ndarray) -> float:
-    """Give the share of placed objects, 0..100."""
-    return 100.0 * float(placed(task, scene, poses).mean())
+    """Give the share of wanted objects that are placed, 0..100."""
+    return 100.0 * float(placed(task, scene, poses)[wanted(scene)].mean())
 
 
 def done(task: base.Task, scene: types.Scene, poses: np.ndarray) -> bool:
-    """Say whether every object is placed."""
+    """Say whether every wanted object is placed."""
     return bool(placed(task, scene, poses).all())
 
 
@@ -57,7 +65,7 @@ def _on_top(scene: types.Scene, poses: np.ndarray) -> np.ndarray:
     return overlap & higher & ~np.eye(len(poses), dtype=bool)
 
 
-def _in_the_way(scene: types.Scene, poses: np.ndarray) -> np.ndarray:
+def in_the_way(scene: types.Scene, poses: np.ndarray) -> np.ndarray:
     """Give `[N, N]`: `[i, j]` when object j stands where i belongs, or above it."""
     poses, size = _boxes(scene, poses)
     goal = np.asarray(scene.goal, float)
@@ -67,7 +75,7 @@ def _in_the_way(scene: types.Scene, poses: np.ndarray) -> np.ndarray:
     return overlap & (top > bottom[:, None] + _STEP) & ~np.eye(len(poses), dtype=bool)
 
 
-def _pickable(scene: types.Scene, poses: np.ndarray) -> np.ndarray:
+def pickable(scene: types.Scene, poses: np.ndarray) -> np.ndarray:
     """Say which objects have nothing on top and a level top face whose centre is in the workspace and in reach."""
     poses, _ = _boxes(scene, poses)
     level = np.abs(geometry.matrix(poses)[:, 2, :]).max(-1) > _FLAT
@@ -82,7 +90,8 @@ def _top_centers(scene: types.Scene, poses: np.ndarray) -> np.ndarray:
     return poses[:, :3] + np.array([0.0, 0.0, 1.0]) * geometry.extent(poses, size)[:, 2:]
 
 
-def _supported(task: base.Task, scene: types.Scene, in_place: np.ndarray) -> np.ndarray:
+def supported(task: base.Task, scene: types.Scene, in_place: np.ndarray) -> np.ndarray:
+    """Say of which objects everything that their goal pose rests on is in place."""
     return ~(task.supports(scene) & ~in_place).any(-1)
 
 
@@ -90,15 +99,15 @@ def ready(task: base.Task, scene: types.Scene, poses: np.ndarray) -> np.ndarray:
     """Say which objects may be picked and placed right now: unplaced, upright, free on top, supports placed, target free."""
     in_place = placed(task, scene, poses)
     upright = geometry.matrix(poses)[:, 2, 2] > _FLAT
-    free = ~_in_the_way(scene, poses).any(-1)
-    return ~in_place & upright & free & _pickable(scene, poses) & _supported(task, scene, in_place)
+    free = ~in_the_way(scene, poses).any(-1)
+    return ~in_place & upright & free & pickable(scene, poses) & supported(task, scene, in_place)
 
 
 def _must_move(task: base.Task, scene: types.Scene, poses: np.ndarray) -> np.ndarray:
     """Say what lies on, or in the way of, an unplaced object whose supports are placed, and in turn on these."""
     in_place, on_top = placed(task, scene, poses), _on_top(scene, poses)
-    wanted = ~in_place & _supported(task, scene, in_place)
-    must = (on_top | _in_the_way(scene, poses))[wanted].any(0)
+    upcoming = ~in_place & supported(task, scene, in_place)
+    must = (on_top | in_the_way(scene, poses))[upcoming].any(0)
     for _ in range(len(must)):
         must |= on_top[must].any(0)
     return must
@@ -108,15 +117,15 @@ def blockers(task: base.Task, scene: types.Scene, poses: np.ndarray) -> np.ndarr
     """Say which objects must be moved away first, where nothing is ready: pickable, and on or in the way of what should go next."""
     if ready(task, scene, poses).any():
         return np.zeros(len(poses), bool)
-    return _must_move(task, scene, poses) & _pickable(scene, poses)
+    return _must_move(task, scene, poses) & pickable(scene, poses)
 
 
 def parking(task: base.Task, scene: types.Scene, poses: np.ndarray, index: int, rng: np.random.Generator) -> np.ndarray | None:
     """Draw a free pose `[7]` on the table for object `index`, clear of the others, of every goal and of the base; None if none is free."""
     poses, size = _boxes(scene, poses)
-    goal, others = np.asarray(scene.goal, float), np.arange(len(poses)) != index
-    taken = np.concatenate([poses[others], goal, np.asarray(scene.base, float)[None]])
-    taken_size = np.concatenate([size[others], size, [task.base_size]])
+    goal, others, shown = np.asarray(scene.goal, float), np.arange(len(poses)) != index, wanted(scene)
+    taken = np.concatenate([poses[others], goal[shown], np.asarray(scene.base, float)[None]])
+    taken_size = np.concatenate([size[others], size[shown], [task.base_size]])
     area = base.Area(base.WORKSPACE.x, base.WORKSPACE.y, size[index, 2] + base.CARRY)
     return base.free_pose(rng, size[index], area, taken, taken_size, tries=_PARKING_TRIES)
 
@@ -166,7 +175,7 @@ def actions(
     return types.PickPlace(pick=pick, place=place, yaw=yaw), np.concatenate(objects)
 
 
-def _move(scene: types.Scene, poses: np.ndarray, index: int, target: np.ndarray, rng: np.random.Generator) -> types.PickPlace:
+def move(scene: types.Scene, poses: np.ndarray, index: int, target: np.ndarray, rng: np.random.Generator) -> types.PickPlace:
     """Bring object `index` to pose `target` `[7]` by the smallest turn, picked at a random point around the middle of its top face."""
     poses, size = _boxes(scene, poses)
     rotation = geometry.matrix(poses[index])
@@ -181,37 +190,45 @@ def _move(scene: types.Scene, poses: np.ndarray, index: int, target: np.ndarray,
     return types.PickPlace(pick=pick.astype(np.float32), place=place.astype(np.float32), yaw=np.float32(yaw))
 
 
-def act(task: base.Task, scene: types.Scene, poses: np.ndarray, rng: np.random.Generator) -> types.PickPlace | None:
-    """Choose one action: a ready object to its goal, else a blocker out of the way; None when complete or when nothing helps.
+def plan(task: base.Task, scene: types.Scene, poses: np.ndarray, rng: np.random.Generator) -> tuple[int, np.ndarray] | None:
+    """Choose an object and the pose `[7]` to bring it to: a ready one to its goal, else a blocker out of the way.
 
-    A blocker that is placed, but not well enough for its neighbour, is put again; another one is parked.
+    A blocker that is placed, but not well enough for its neighbour, is put again; another one is parked. None when complete or when
+    nothing helps.
     """
     poses, goal = np.asarray(poses, float), np.asarray(scene.goal, float)
     choice = np.flatnonzero(ready(task, scene, poses))
     if len(choice):
         index = int(rng.choice(choice))
-        return _move(scene, poses, index, goal[index], rng)
+        return index, goal[index]
     # What stands on a thing that must move too would only be in the way again.
-    again = placed(task, scene, poses) & ~_in_the_way(scene, poses).any(-1) & ~_on_top(scene, poses)[_must_move(task, scene, poses)].any(0)
+    again = placed(task, scene, poses) & wanted(scene) & ~in_the_way(scene, poses).any(-1)
+    again &= ~_on_top(scene, poses)[_must_move(task, scene, poses)].any(0)
     for index in rng.permutation(np.flatnonzero(blockers(task, scene, poses))):
         target = goal[index] if again[index] else parking(task, scene, poses, int(index), rng)
         if target is not None:
-            return _move(scene, poses, int(index), target, rng)
+            return int(index), target
     return None
+
+
+def act(task: base.Task, scene: types.Scene, poses: np.ndarray, rng: np.random.Generator) -> types.PickPlace | None:
+    """Choose one action, the move that `plan` chose; None when complete or when nothing helps."""
+    chosen = plan(task, scene, poses, rng)
+    return None if chosen is None else move(scene, poses, *chosen, rng)
 
 
 def blind(task: base.Task, scene: types.Scene, poses: np.ndarray, rng: np.random.Generator) -> types.PickPlace | None:
     """Choose an action that ignores which object belongs where: a random object that is nowhere yet to a random supported free place.
 
-    It knows all places but neither order nor sizes: what a policy that never looks at the goal's identities can reach.
-    None when nothing is left to do.
+    It knows all places but neither order nor sizes, and takes distractors too: what a policy that never looks at the goal's identities
+    can reach. None when nothing is left to do.
     """
     poses, goal = np.asarray(poses, float), np.asarray(scene.goal, float)
     offset = np.abs(poses[:, None, :3] - goal[None, :, :3])  # [object, place, axis]
     at = (offset[..., :2] < 0.025).all(-1) & (offset[..., 2] < 0.02)
     occupied = at.any(0)
-    places = np.flatnonzero(~occupied & ~(task.supports(scene) & ~occupied).any(-1))
-    objects = np.flatnonzero(~at.any(1) & _pickable(scene, poses))
+    places = np.flatnonzero(~occupied & wanted(scene) & supported(task, scene, occupied))
+    objects = np.flatnonzero(~at.any(1) & pickable(scene, poses))
     if not len(places) or not len(objects):
         return None
-    return _move(scene, poses, int(rng.choice(objects)), goal[rng.choice(places)], rng)
+    return move(scene, poses, int(rng.choice(objects)), goal[rng.choice(places)], rng)

@@ -234,6 +234,48 @@ def test_blind_fills_the_pallet():
     assert oracle.score(task, scene, poses) < 100.0
 
 
+@pytest.mark.parametrize("name", tasks.names())
+def test_distractors_never_count_and_are_never_ready(name):
+    plain, task = tasks.get(name), tasks.get(name, distractors=2)
+    scene, bare, count = task.sample(4), plain.sample(4), plain.num_objects
+    assert oracle.wanted(scene).tolist() == [True] * count + [False] * 2 and oracle.wanted(bare).all()
+    done = np.concatenate([goal(scene)[:count], start(scene)[count:]])
+    for poses in (start(scene), done, np.concatenate([start(scene)[:2], done[2:]])):
+        np.testing.assert_array_equal(oracle.ready(task, scene, poses), [*oracle.ready(plain, bare, poses[:count]), False, False])
+        assert oracle.score(task, scene, poses) == oracle.score(plain, bare, poses[:count])
+    assert oracle.done(task, scene, done) and oracle.act(task, scene, done, np.random.default_rng(0)) is None
+    poses, actions = run(task, scene, start(scene), oracle.act, np.random.default_rng(0))
+    assert oracle.score(task, scene, poses) == 100.0 and actions == count
+    np.testing.assert_array_equal(poses[count:], start(scene)[count:])
+
+
+@pytest.mark.parametrize("name", tasks.names())
+def test_a_distractor_in_the_way_is_parked(name):
+    task = tasks.get(name, distractors=2)
+    scene = task.sample(4)
+    first = int(np.flatnonzero(~task.supports(scene).any(-1))[0])
+    poses = start(scene)
+    top = scene.base[2] + task.base_size[2] / 2
+    poses[-1] = [*goal(scene)[first, :2], top + scene.size[-1, 2] / 2, 1, 0, 0, 0]
+    assert not oracle.ready(task, scene, poses)[[first, -1]].any()
+    after, _ = run(task, scene, poses, oracle.act, np.random.default_rng(0))
+    assert oracle.score(task, scene, after) == 100.0
+    assert after[-1, 2] == pytest.approx(scene.size[-1, 2] / 2) and np.linalg.norm(after[-1, :2] - poses[-1, :2]) > 0.04
+    np.testing.assert_array_equal(after[-2], poses[-2])
+
+
+def test_blind_takes_distractors_too_but_puts_nothing_where_they_belong():
+    task, taken = tasks.get("tower", num_objects=2, distractors=2), 0
+    scene = task.sample(1)
+    for seed in range(20):
+        poses, count = run(task, scene, start(scene), oracle.blind, np.random.default_rng(seed))
+        levels = np.sort(poses[np.linalg.norm(poses[:, :2] - scene.base[:2], axis=-1) < 1e-5, 2])
+        np.testing.assert_allclose(levels, goal(scene)[:2, 2], atol=1e-5)
+        assert count == 2
+        taken += int((poses[2:] != start(scene)[2:]).any(-1).sum())
+    assert 8 < taken < 32  # one in two, 20 on average
+
+
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_oracle_scores_100_through_the_real_primitive(task, seed):
     scene, rng = task.sample(seed), np.random.default_rng(seed)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import zlib
 
 import hypothesis
 import jax
@@ -11,7 +12,8 @@ import pytest
 from hypothesis import strategies as st
 
 from lala_jax.perception import transforms
-from lala_jax.sim import robot, tasks
+from lala_jax.sim import render, robot, tasks
+from lala_jax.sim import scene as scenes
 from lala_jax.sim.tasks import base, geometry, pallet
 
 SEEDS = range(12)
@@ -113,8 +115,8 @@ def test_only_the_paper_palette_has_brown():
 
 
 def test_tower_sentence_names_the_blocks_bottom_to_top():
-    task = tasks.get("tower", num_objects=2)
-    scene = task.sample(0).replace(color=np.array([[78, 121, 167], [255, 255, 255]]) / 255)
+    task = tasks.get("tower", num_objects=2, distractors=1)
+    scene = task.sample(0).replace(color=np.array([[78, 121, 167], [255, 255, 255], [89, 169, 79]]) / 255)
     assert task.sentence(scene) == "make the tower with blue, white blocks"
 
 
@@ -206,10 +208,12 @@ def test_an_area_out_of_reach_has_no_free_pose():
     ("name", "options", "message"),
     [
         ("towers", {}, "unknown task 'towers', choose one of pallet, tower"),
-        ("tower", {"size": 3}, "no option size; its options are colors, edge, max_actions, num_objects"),
+        ("tower", {"size": 3}, "no option size; its options are colors, distractors, edge, max_actions, num_objects"),
         ("tower", {"num_objects": 7}, "num_objects=7 is not one of 1..6"),
         ("tower", {"edge": (0.05, 0.04)}, "edge="),
-        ("tower", {"colors": "loud"}, r"colors='loud' is not one of \['code', 'paper'\]"),
+        ("tower", {"colors": "loud"}, r"colors='loud' is not one of \['code', 'paper', 'uniform'\]"),
+        ("tower", {"distractors": -1}, r"distractors=-1 is not one of 0\.\.6"),
+        ("pallet", {"distractors": 3, "colors": "code"}, r"distractors=3 is not one of 0\.\.2"),
         ("tower", {"max_actions": 0}, "max_actions=0 must be at least 1"),
         ("pallet", {"num_objects": 3}, "num_objects=3 is not 8"),
     ],
@@ -217,6 +221,85 @@ def test_an_area_out_of_reach_has_no_free_pose():
 def test_mistakes_are_named(name, options, message):
     with pytest.raises(ValueError, match=message):
         tasks.get(name, **options)
+
+
+def checksum(scene, count):
+    """A checksum of all bytes of the first `count` objects and the base."""
+    leaves = {field.name: getattr(scene, field.name) for field in dataclasses.fields(scene)}
+    return zlib.crc32(b"".join((leaf if name == "base" else leaf[:count]).tobytes() for name, leaf in leaves.items()))
+
+
+@pytest.mark.parametrize("distractors", [0, 2])
+@pytest.mark.parametrize(
+    ("name", "seed", "recorded"),
+    [
+        *[("tower", 0, 387708376), ("tower", 7, 1236221978), ("tower", 123, 547313063)],
+        *[("pallet", 0, 198046820), ("pallet", 7, 196761938), ("pallet", 123, 1432080776)],
+    ],
+)
+def test_scenes_are_what_they_were_before_there_were_distractors(name, seed, recorded, distractors):
+    task = tasks.get(name, distractors=distractors)
+    assert checksum(task.sample(seed), task.num_objects) == recorded
+
+
+@pytest.mark.parametrize("name", tasks.names())
+@pytest.mark.parametrize("seed", SEEDS)
+def test_distractors_lie_free_on_the_table_and_are_told_from_the_others(name, seed):
+    task = tasks.get(name, distractors=2)
+    scene, count = task.sample(seed), task.num_objects
+    assert all(
+        len(leaf) == count + 2 for leaf in (scene.size, scene.color, scene.start, scene.goal, scene.symmetry, task.object_mass(scene))
+    )
+    assert (scene.goal[:count, 2] > 0).all() and (scene.goal[count:, 2] + scene.size[count:, 2] < 0).all()
+    assert len(np.unique(scene.color, axis=0)) == count + 2
+    assert not task.supports(scene)[count:].any() and not task.supports(scene)[:, count:].any()
+    clouds = [edge_points(*box) for box in [*zip(scene.start, scene.size, strict=True), (scene.base, np.array(task.base_size))]]
+    for i in range(count, count + 2):
+        assert scene.start[i, 2] == pytest.approx(scene.size[i, 2] / 2)
+        for cloud in [*clouds[:i], *clouds[i + 1 :]]:
+            assert np.linalg.norm(clouds[i][:, None] - cloud, axis=-1).min() >= 0.015 - 1e-6
+    if name == "tower":
+        np.testing.assert_allclose(scene.size, 0.04)
+    else:
+        sides = scene.size[count:, :2]
+        assert (sides >= 0.05).all() and (sides <= 0.09).all() and (scene.start[:, 1] < 0).all()
+        np.testing.assert_allclose(scene.size[count:, 2], 0.05)
+    assert task.max_actions == tasks.get(name).max_actions
+
+
+@pytest.mark.parametrize("preset", sorted(scenes.PRESETS))
+@pytest.mark.parametrize("name", tasks.names())
+def test_no_camera_sees_a_distractor_in_the_goal_picture(name, preset):
+    task = tasks.get(name, distractors=2)
+    scene, camera = task.sample(4), scenes.cameras(preset, height=120, width=160)
+    template = scenes.geom_template(task)
+    geoms = np.array(scenes.object_geoms(template[0]))
+    for poses, shown in ((scene.start, 2), (scene.goal, 0)):
+        placed = scenes.place(*template, size=scene.size, color=scene.color, poses=poses, base=scene.base)
+        seen = np.asarray(render.render(*placed, camera, segmentation=True).segmentation)
+        assert seen.shape[0] == 4
+        assert len(set(geoms[-2:]) & set(np.unique(seen))) == shown
+        assert set(geoms[-3:-2]) <= set(np.unique(seen))
+
+
+@pytest.mark.parametrize("name", tasks.names())
+def test_uniform_colours_are_as_far_apart_as_the_palette_and_are_not_in_it(name):
+    paper = np.array(list(base.COLORS.values())) / 255
+    least = min(np.linalg.norm(a - b) for i, a in enumerate(paper) for b in paper[:i])
+    task = tasks.get(name, colors="uniform", distractors=2)
+    drawn = np.stack([task.sample(seed).color for seed in range(40)])
+    for color in drawn:
+        assert min(np.linalg.norm(a - b) for i, a in enumerate(color) for b in color[:i]) >= least - 1e-6
+    alone = dataclasses.replace(task, distractors=0)
+    np.testing.assert_array_equal(alone.sample(3).color, drawn[3, : task.num_objects])
+    assert drawn.min() >= 0 and drawn.max() <= 1
+    assert np.abs(drawn.mean((0, 1)) - 0.5).max() < 0.08 and drawn.min((0, 1)).max() < 0.05 and drawn.max((0, 1)).min() > 0.95
+    assert np.linalg.norm(drawn[:, :, None] - paper, axis=-1).min(-1).mean() > 0.15
+
+
+def test_too_many_colours_too_far_apart_are_refused():
+    with pytest.raises(ValueError, match="no colour 1.500 away from 1 others in 1000 draws: 1 of 3 found"):
+        base.uniform_colors(np.random.default_rng(0), 3, taken=np.zeros((0, 3)), apart=1.5)
 
 
 def test_a_negative_seed_is_refused():

@@ -27,6 +27,22 @@ COLORS = {
     "gray": (186, 176, 172),
 }
 PALETTES = {"paper": tuple(COLORS), "code": tuple(name for name in COLORS if name != "brown")}
+COLOR_CHOICES = (*PALETTES, "uniform")  # uniform: anywhere in the RGB cube
+
+
+def palette(name: str) -> np.ndarray:
+    """Give the colours `[P, 3]` of a palette, RGB in 0..1."""
+    return np.array([COLORS[color] for color in PALETTES[name]]) / 255.0
+
+
+def closest(colors: np.ndarray) -> float:
+    """Give the Euclidean distance of the closest two of `colors` `[P, 3]`."""
+    first, second = np.triu_indices(len(colors), 1)
+    return float(np.linalg.norm(colors[first] - colors[second], axis=-1).min())
+
+
+APART = closest(palette("paper"))  # colours drawn uniformly are at least so far from each other
+BURIED = -1.0  # metres, the height of a distractor's goal: under the table, where no camera sees it
 
 WORKSPACE = types.MapSpec()
 MARGIN = 0.015  # metres between the footprints of two objects at the start
@@ -36,6 +52,7 @@ HOVER = 0.10  # metres, at least so far above a goal the arm must reach
 TRIES = 128  # candidate poses an object gets in one attempt
 _FIRST = 8  # candidates looked at before the others
 ATTEMPTS = 20  # fresh starts before `NoFreePose`
+COLOR_TRIES = 1000  # draws a uniform colour gets
 
 
 class NoFreePose(RuntimeError):
@@ -99,21 +116,40 @@ def free_poses(
     )
 
 
+def uniform_colors(rng: np.random.Generator, count: int, *, taken: np.ndarray, apart: float) -> np.ndarray:
+    """Draw `count` colours `[count, 3]` uniformly in RGB 0..1, one after another, `apart` from each other and from `taken` `[K, 3]`."""
+    colors = taken
+    for index in range(count):
+        drawn = rng.uniform(size=(COLOR_TRIES, 3))
+        free = (np.linalg.norm(drawn[:, None] - colors, axis=-1) >= apart).all(-1)
+        if not free.any():
+            raise ValueError(f"no colour {apart:.3f} away from {len(colors)} others in {COLOR_TRIES} draws: {index} of {count} found")
+        colors = np.concatenate([colors, drawn[[np.argmax(free)]]])
+    return colors[len(colors) - count :]
+
+
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """The facts of a task; hashable, so that compiled models may be kept per task."""
+    """The facts of a task; hashable, so that compiled models may be kept per task.
 
-    num_objects: int
-    colors: str = "paper"  # a name in PALETTES
+    Distractors are further objects on the table, the scene's last ones, that the goal does not show: their goal poses are under the table.
+    """
+
+    num_objects: int  # that the goal shows
+    colors: str = "paper"  # one of COLOR_CHOICES
     max_actions: int | None = None  # None: the task's own budget
+    distractors: int = 0
 
     name: ClassVar[str]
     base_size: ClassVar[tuple[float, float, float]]  # full extents, metres
     base_color: ClassVar[tuple[float, float, float]]  # RGB 0..1
 
     def __post_init__(self):
-        if self.colors not in PALETTES:
-            raise ValueError(f"task {self.name}: colors={self.colors!r} is not one of {sorted(PALETTES)}")
+        if self.colors not in COLOR_CHOICES:
+            raise ValueError(f"task {self.name}: colors={self.colors!r} is not one of {sorted(COLOR_CHOICES)}")
+        most = len(PALETTES.get(self.colors, COLORS)) - self.num_objects
+        if self.distractors and not 0 < self.distractors <= most:
+            raise ValueError(f"task {self.name}: distractors={self.distractors} is not one of 0..{most}: each has a colour of its own")
         budget = self.default_max_actions() if self.max_actions is None else self.max_actions
         if budget < 1:
             raise ValueError(f"task {self.name}: max_actions={budget} must be at least 1")
@@ -124,8 +160,16 @@ class Task:
         raise NotImplementedError
 
     def build(self, rng: np.random.Generator) -> types.Scene:
-        """Draw one scene in float64 numpy; `sample` seeds it and fixes the dtype."""
+        """Draw one scene in float64 numpy, without distractors; `sample` seeds it, adds them and fixes the dtype."""
         raise NotImplementedError
+
+    def build_distractors(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Draw the distractors' sizes `[D, 3]` in metres and symmetries `[D]` in radians."""
+        raise NotImplementedError
+
+    def start_area(self, size: np.ndarray) -> Area:
+        """Say where boxes of `size` `[N, 3]` lie at the start."""
+        return Area(WORKSPACE.x, WORKSPACE.y, size[:, 2].max() + CARRY)
 
     def object_mass(self, scene: types.Scene) -> np.ndarray:
         """Give the objects' masses `[N]` in kilograms."""
@@ -135,16 +179,36 @@ class Task:
         """Give the scene of `seed` (at least 0), float32 numpy leaves: a pure function of the task's fields and the seed."""
         if seed < 0:
             raise ValueError(f"task {self.name}: seed={seed} must be at least 0")
-        scene = self.build(np.random.default_rng([seed, zlib.crc32(self.name.encode())]))
+        rng = np.random.default_rng([seed, zlib.crc32(self.name.encode())])
+        scene = self.build(rng)
+        if self.distractors:  # after all else: the other objects stay what they are without
+            scene = self._with_distractors(rng, scene)
         return types.Scene(**{field.name: np.asarray(getattr(scene, field.name), np.float32) for field in dataclasses.fields(scene)})
 
-    def draw_colors(self, rng: np.random.Generator, *, distinct: bool = True) -> np.ndarray:
-        """Draw the objects' RGB `[N, 3]` in 0..1 from the palette."""
-        names = PALETTES[self.colors]
-        if distinct and self.num_objects > len(names):
-            raise ValueError(f"task {self.name}: {self.num_objects} distinct colours asked of the {len(names)} in palette {self.colors!r}")
-        chosen = rng.choice(len(names), self.num_objects, replace=not distinct)
-        return np.array([COLORS[names[i]] for i in chosen]) / 255.0
+    def _with_distractors(self, rng: np.random.Generator, scene: types.Scene) -> types.Scene:
+        """Add the distractors, clear of all that lies on the table."""
+        size, symmetry = self.build_distractors(rng)
+        color = self.draw_colors(rng, count=self.distractors, taken=np.asarray(scene.color))
+        others = np.concatenate([scene.start, scene.base[None]]), np.concatenate([scene.size, [self.base_size]])
+        order = np.arange(self.distractors)
+        start = free_poses(rng, size, self.start_area(size), order=order, others=others[0], other_size=others[1])
+        goal = np.column_stack([start[:, :2], np.full(len(start), BURIED), start[:, 3:]])
+        more = {"size": size, "color": color, "start": start, "goal": goal, "symmetry": symmetry}
+        return scene.replace(**{name: np.concatenate([getattr(scene, name), rows]) for name, rows in more.items()})
+
+    def draw_colors(
+        self, rng: np.random.Generator, *, count: int | None = None, taken: np.ndarray | None = None, distinct: bool = True
+    ) -> np.ndarray:
+        """Draw RGB `[count, 3]` in 0..1, of `num_objects` unless told: none of `taken` `[K, 3]`, and distinct unless told."""
+        count = self.num_objects if count is None else count
+        taken = np.zeros((0, 3)) if taken is None else taken
+        if self.colors == "uniform":
+            return uniform_colors(rng, count, taken=taken, apart=APART if distinct else 0.0)
+        colors = palette(self.colors)
+        colors = colors[(colors[:, None] != taken).any(-1).all(-1)]
+        if distinct and count > len(colors):
+            raise ValueError(f"task {self.name}: {count} distinct colours asked of the {len(colors)} in palette {self.colors!r}")
+        return colors[rng.choice(len(colors), count, replace=not distinct)]
 
     def supports(self, scene: types.Scene) -> np.ndarray:
         """Give `[N, N]` bool: `[i, j]` when goal pose i rests on goal pose j, so that j must be in place before i."""

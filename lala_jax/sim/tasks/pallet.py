@@ -15,6 +15,12 @@ REGION = (0.15, 0.15, 0.10)  # metres, the block that is split
 SMALLEST = 0.05  # metres, smallest side of a cell of the split
 GAP = 0.01  # metres between neighbours in x and y, half from each
 TOP = 0.0388  # metres, the pallet's top
+DISTRACTOR = (0.05, 0.09)  # metres, range of a distractor's sides in x and y
+
+
+def symmetry(size: np.ndarray) -> np.ndarray:
+    """Give the symmetries `[N]` in radians of boxes of `size` `[N, 3]`: a quarter turn where they are square, half a turn otherwise."""
+    return np.where(np.abs(size[:, 0] - size[:, 1]) < 0.001, np.pi / 2, np.pi)
 
 
 def split(rng: np.random.Generator, low: np.ndarray, high: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -55,7 +61,17 @@ class PalletTask(base.Task):
 
     def object_mass(self, scene: types.Scene) -> np.ndarray:
         """Give the boxes' masses `[N]`: 0.1 kg each."""
-        return np.full(self.num_objects, 0.1)
+        return np.full(len(np.asarray(scene.size)), 0.1)
+
+    def start_area(self, size: np.ndarray) -> base.Area:
+        """Give the left half of the table."""
+        return base.Area(base.WORKSPACE.x, (base.WORKSPACE.y[0], 0.0), size[:, 2].max() + base.CARRY)
+
+    def build_distractors(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Draw boxes about as large as the others."""
+        sides = rng.uniform(*DISTRACTOR, (self.distractors, 2))
+        size = np.column_stack([sides, np.full(self.distractors, REGION[2] / 2)])
+        return size, symmetry(size)
 
     def build(self, rng: np.random.Generator) -> types.Scene:
         pallet = transforms.pose_from_yaw([0.5, 0.25, TOP - self.base_size[2] / 2], 0.0)
@@ -63,8 +79,6 @@ class PalletTask(base.Task):
         low, high = (np.array(side) for side in zip(*split(rng, corner, corner + REGION), strict=True))
         size, goal = high - low, transforms.pose_from_yaw((low + high) / 2, np.zeros(len(low)))
         color = self.draw_colors(rng, distinct=self.distinct_colors)
-        area = base.Area(base.WORKSPACE.x, (base.WORKSPACE.y[0], 0.0), size[:, 2].max() + base.CARRY)
         order = np.argsort(-goal[:, 2], kind="stable")
-        start = base.free_poses(rng, size, area, order=order, others=pallet[None], other_size=np.array([self.base_size]))
-        symmetry = np.where(np.abs(size[:, 0] - size[:, 1]) < 0.001, np.pi / 2, np.pi)
-        return types.Scene(size=size, color=color, base=pallet, start=start, goal=goal, symmetry=symmetry)
+        start = base.free_poses(rng, size, self.start_area(size), order=order, others=pallet[None], other_size=np.array([self.base_size]))
+        return types.Scene(size=size, color=color, base=pallet, start=start, goal=goal, symmetry=symmetry(size))

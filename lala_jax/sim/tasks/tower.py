@@ -38,8 +38,15 @@ class TowerTask(base.Task):
         """Give the cubes' masses `[N]`: 0.01 kg at 0.04 m, with the volume otherwise."""
         return 0.01 * np.prod(np.asarray(scene.size, float), axis=-1) / 0.04**3
 
+    def build_distractors(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Draw cubes like the others."""
+        return self._cubes(rng, self.distractors), np.full(self.distractors, np.pi / 2)
+
+    def _cubes(self, rng: np.random.Generator, count: int) -> np.ndarray:
+        return np.repeat(rng.uniform(*self.edge, (count, 1)), 3, axis=1)
+
     def build(self, rng: np.random.Generator) -> types.Scene:
-        size = np.repeat(rng.uniform(*self.edge, (self.num_objects, 1)), 3, axis=1)
+        size = self._cubes(rng, self.num_objects)
         color = self.draw_colors(rng)
         # The finished tower and a cube held above it must be in reach.
         high = base.Area(base.WORKSPACE.x, base.WORKSPACE.y, self.base_size[2] + size[:, 2].sum() + base.HOVER)
@@ -47,11 +54,10 @@ class TowerTask(base.Task):
         stand = base.free_poses(rng, np.array([self.base_size]), high, order=np.arange(1), others=none[0], other_size=none[1])
         z = self.base_size[2] + np.cumsum(size[:, 2]) - size[:, 2] / 2
         goal = transforms.pose_from_yaw(np.column_stack([np.repeat(stand[:, :2], self.num_objects, axis=0), z]), geometry.yaw(stand))
-        area = base.Area(base.WORKSPACE.x, base.WORKSPACE.y, size[:, 2].max() + base.CARRY)
         order = np.arange(self.num_objects)[::-1]
-        start = base.free_poses(rng, size, area, order=order, others=stand, other_size=np.array([self.base_size]))
+        start = base.free_poses(rng, size, self.start_area(size), order=order, others=stand, other_size=np.array([self.base_size]))
         return types.Scene(size=size, color=color, base=stand[0], start=start, goal=goal, symmetry=np.full(self.num_objects, np.pi / 2))
 
     def sentence(self, scene: types.Scene) -> str:
         """Say the goal for a language-conditioned baseline, bottom to top."""
-        return f"make the tower with {', '.join(base.color_name(rgb) for rgb in np.asarray(scene.color))} blocks"
+        return f"make the tower with {', '.join(base.color_name(rgb) for rgb in np.asarray(scene.color)[: self.num_objects])} blocks"
