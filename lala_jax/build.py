@@ -86,9 +86,9 @@ def build_policy(config: Mapping[str, Any]) -> policy.Policy:
             raise options.OptionsError(f"goal_aware needs map rows, map cols and model.crop in multiples of 4, got {sizes}")
         model = goal_aware.GoalAware(
             spec=spec, rotations=fields["rotations"], tokens=fields["tokens"], trunk_width=fields["trunk_width"],
-            trunk_blocks=fields["trunk_blocks"], fine_width=fields["width"], **shared,
+            trunk_blocks=fields["trunk_blocks"], fine_width=fields["width"], matching=fields["matching"], **shared,
         )  # fmt: skip
-        choices = {name: fields[name] for name in ("multi_action", "match_weight", "refine")}
+        choices = {name: fields[name] for name in ("multi_action", "match_weight", "refine", "max_height", "average_turns")}
         return policy.GoalAwarePolicy(model=model, **choices)
     try:
         net = transporter.Transporter(

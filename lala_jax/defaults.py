@@ -54,7 +54,10 @@ def get(arg: str, *, task: str) -> ml_collections.ConfigDict:
     config.model.tokens = 704  # goal voxels that the pick is matched with
     config.model.multi_action = True  # supervise every right action, not one
     config.model.match_weight = 1.0
-    config.model.refine = True  # regress below the cell and the bin
+    config.model.matching = True  # tell pick and place which voxels of the two maps look alike
+    config.model.refine = True  # regress below the cell and the bin, and tell quarter turns apart
+    config.model.max_height = False  # see only what is highest in each column
+    config.model.average_turns = False  # act on the mean of the logits of the maps as they are and turned by 180 degrees
 
     config.augment = ml_collections.ConfigDict()
     config.augment.recolor = True

@@ -130,10 +130,16 @@ class GoalAwarePolicy:
     match_weight: float = 1.0
     refine_weight: float = 1.0
     refine: bool = True
+    max_height: bool = False  # see only what is highest in each column
+    average_turns: bool = False  # act on the mean of the logits of both maps as they are and turned by 180 degrees
 
     @property
     def spec(self) -> types.MapSpec:
         return self.model.spec
+
+    @property
+    def _matches(self) -> bool:
+        return bool(self.match_weight and self.model.matching)
 
     def init(self, key: jax.Array):
         """Make the parameters."""
@@ -153,7 +159,7 @@ class GoalAwarePolicy:
             "pick": losses.masked_cross_entropy(match.pick, sample.pick_best),
             "place": losses.place_cross_entropy(place.logits, sample.bins, sample.cells, sample.valid),
         }
-        if self.match_weight:
+        if self._matches:
             terms["match"], terms["next"], match_right = self._match_losses(key_match, state, match)
         if self.refine:
             terms["refine"], terms["fit"], refined = self._refine_losses(variables, key_refine, state, match, layout)
@@ -161,13 +167,15 @@ class GoalAwarePolicy:
         total += self.refine_weight * (terms.get("refine", 0.0) + terms.get("fit", 0.0))
         metrics = {f"loss_{name}": value for name, value in terms.items()} | {"loss": total}
         metrics |= hits(sample, match.pick, place.logits, spec=spec, rotations=model.rotations)
-        if self.match_weight:
+        if self._matches:
             metrics["match_right"] = match_right
         if self.refine:
             metrics |= refined
         return total, metrics
 
     def _look(self, variables, current, goal):
+        if self.max_height:
+            current, goal = topdown.keep_highest(current), topdown.keep_highest(goal)
         apply = self.model.apply
         return apply(variables, current, goal, method="match"), apply(variables, current, goal, method="layout")
 
@@ -259,10 +267,19 @@ class GoalAwarePolicy:
         """Choose an action: the best pick, its best place or that one's quarter turn that fits better, refined below cell and bin."""
         variables, model, spec = {"params": params}, self.model, self.spec
         match, layout = self._look(variables, current, goal)
-        pick = jnp.stack(argmax_index(match.pick))
+        pick_logits = match.pick
+        if self.average_turns:
+            turned, turned_layout = self._look(variables, topdown.half_turn(current), topdown.half_turn(goal))
+            pick_logits = (pick_logits + turned.pick[::-1, ::-1]) / 2
+        pick = jnp.stack(argmax_index(pick_logits))
         target = model.apply(variables, match, pick, method="target")
-        place = model.apply(variables, layout, target, pick, method="place")
-        cells, turns = self._guesses(place.logits)
+        place_logits = model.apply(variables, layout, target, pick, method="place").logits
+        if self.average_turns:
+            there = jnp.array([spec.rows - 1, spec.cols - 1]) - pick
+            target_there = model.apply(variables, turned, there, method="target")
+            place_there = model.apply(variables, turned_layout, target_there, there, method="place").logits
+            place_logits = (place_logits + place_there[:, ::-1, ::-1]) / 2
+        cells, turns = self._guesses(place_logits)
         cell, turn = cells[0] + 0.5, turns[0].astype(jnp.float32)
         if self.refine:
             limit = jnp.array([spec.rows, spec.cols])
@@ -274,9 +291,8 @@ class GoalAwarePolicy:
                 at, turns = jnp.clip(start + 0.5 + offset[:, :2], 0.0, limit), turns + offset[:, 2]
             best = fit.argmax()  # the first, the best place, where none fits better
             cell, turn = at[best], turns[best]
-        return _to_action(spec, current, pick, types.world_from_cell(spec, cell), turn * (2 * math.pi / model.rotations)), Heatmaps(
-            match.pick, place.logits
-        )
+        yaw = turn * (2 * math.pi / model.rotations)
+        return _to_action(spec, current, pick, types.world_from_cell(spec, cell), yaw), Heatmaps(pick_logits, place_logits)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -173,6 +173,7 @@ class GoalAware(nn.Module):
     trunk_blocks: int = 3
     fine_width: int = 24
     channels: int = 4  # of key and query
+    matching: bool = True  # False: neither pick nor place is told which voxels of the two maps look alike
 
     def setup(self):
         self.voxel = VoxelEmbedding(width=32, embed=self.embed)
@@ -203,7 +204,8 @@ class GoalAware(nn.Module):
         at = (token[:, 0], token[:, 1], token[:, 2])
         embedding = self.voxel(_voxel_input(goal_color, goal_count)[at])
         token_next = jnp.where(valid, upcoming[at], -1e9)
-        coarse = jnp.where(valid.any(), jax.nn.logsumexp(surface @ embedding.T + token_next, axis=-1), 0.0)
+        alike = jax.nn.logsumexp(surface @ embedding.T + token_next, axis=-1)
+        coarse = jnp.where(valid.any(), alike, 0.0) * float(self.matching)
         pick = self._pick_fine(current, goal, context) + _upsample(coarse[..., None], POOL)[..., 0]
         return Match(pick, surface, token, valid, embedding, token_next)
 
@@ -241,7 +243,7 @@ class GoalAware(nn.Module):
         """
         picked = match.current[pick[0] // POOL, pick[1] // POOL]
         score = jnp.where(match.token_valid, match.token_embedding @ picked, -1e9)
-        share = jax.lax.stop_gradient(jnp.exp(score - score.max())) * match.token_valid
+        share = jax.lax.stop_gradient(jnp.exp(score - score.max())) * match.token_valid * float(self.matching)
         grid = (self.spec.rows // POOL, self.spec.cols // POOL, self.spec.slices)
         weight = jnp.zeros(grid).at[match.token[:, 0], match.token[:, 1], match.token[:, 2]].set(share)
         level = weight.max((0, 1))

@@ -117,6 +117,23 @@ def max_height(topdown: types.TopDownMap) -> Float[Array, "rows cols channels"]:
     return jnp.concatenate([highest(topdown.features, topdown.count > 0), topdown.height[..., None]], axis=-1)
 
 
+def keep_highest(topdown: types.TopDownMap) -> types.TopDownMap:
+    """Forget all but each column's highest voxel: what a max-height map knows."""
+    seen = topdown.count > 0
+    keep = seen & (jnp.cumsum(seen[..., ::-1], axis=-1)[..., ::-1] == 1)
+    return topdown.replace(
+        features=jnp.where(keep[..., None], topdown.features, 0.0),
+        count=jnp.where(keep, topdown.count, 0.0),
+        offset=jnp.where(keep[..., None], topdown.offset, 0.0),
+    )
+
+
+def half_turn(topdown: types.TopDownMap) -> types.TopDownMap:
+    """Turn a map by 180 degrees about its middle."""
+    turned = jax.tree.map(lambda leaf: leaf[::-1, ::-1], topdown)
+    return turned.replace(offset=-turned.offset, skin=-turned.skin)
+
+
 def highest(values: Float[Array, "rows cols slices c"], seen: Bool[Array, "rows cols slices"]) -> Float[Array, "rows cols c"]:
     """Take each column's value in its highest occupied slice."""
     top = seen.shape[-1] - 1 - jnp.argmax(seen[..., ::-1], axis=-1)
