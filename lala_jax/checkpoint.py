@@ -179,8 +179,8 @@ def _candidates(path: pathlib.Path, which: str) -> list[tuple[pathlib.Path, int]
     return found
 
 
-def _named(tree: Any) -> dict[str, Any]:
-    """Flatten a pytree to leaves by name."""
+def named(tree: Any) -> dict[str, Any]:
+    """Flatten a pytree to leaves by name, their path: `params/Dense_0/kernel`."""
     leaves = {}
     for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
         name = jax.tree_util.keystr(path, simple=True, separator="/") or "value"
@@ -218,7 +218,7 @@ def _save(folder: pathlib.Path, step: int, state: Any, facts: Mapping[str, Any])
     """Write the payload, then the side file, which makes it count."""
     from orbax.checkpoint import v1 as ocp
 
-    leaves = {name: _host(name, leaf) for name, leaf in _named(state).items()}
+    leaves = {name: _host(name, leaf) for name, leaf in named(state).items()}
     if not leaves:
         raise CheckpointError(f"the state of step {step} has no leaves")
     described = {name: {"shape": leaf.shape, "dtype": str(leaf.dtype), "crc32": _crc(leaf)} for name, leaf in leaves.items()}
@@ -289,8 +289,8 @@ def _restore(folder: pathlib.Path, step: int, template: Any) -> Any:
     _check_files(folder / str(step), side)
     leaves = _read_payload(folder / str(step), described)
     if template is None:
-        return _nest(leaves)
-    placed = [_place(leaves[name], leaf) for name, leaf in _named(template).items()]
+        return nest(leaves)
+    placed = [_place(leaves[name], leaf) for name, leaf in named(template).items()]
     return jax.tree_util.tree_unflatten(jax.tree_util.tree_structure(template), placed)
 
 
@@ -307,7 +307,7 @@ def _check_files(path: pathlib.Path, side: Mapping[str, Any]) -> None:
 
 def _check_template(path: pathlib.Path, described: Mapping[str, Any], template: Any) -> None:
     """Raise MismatchError on the first leaf that differs, before any payload is read (Orbax would cast dtypes silently)."""
-    numbers = {name: leaf if hasattr(leaf, "dtype") else np.asarray(leaf) for name, leaf in _named(template).items()}
+    numbers = {name: leaf if hasattr(leaf, "dtype") else np.asarray(leaf) for name, leaf in named(template).items()}
     expected = {name: (tuple(leaf.shape), str(leaf.dtype)) for name, leaf in numbers.items()}
     stored = {name: (tuple(leaf["shape"]), leaf["dtype"]) for name, leaf in described.items()}
     names = [name for name in sorted(expected.keys() | stored.keys()) if expected.get(name) != stored.get(name)]
@@ -335,8 +335,8 @@ def _read_payload(path: pathlib.Path, described: Mapping[str, Any]) -> dict[str,
     return {name: np.asarray(leaves[name]) for name in described}
 
 
-def _nest(leaves: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Turn `a/b` names into nested dicts."""
+def nest(leaves: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Turn `a/b` names into nested dicts: the inverse of `named` for trees of dicts."""
     tree: dict[str, Any] = {}
     for name, leaf in leaves.items():
         *parents, last = name.split("/")

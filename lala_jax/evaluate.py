@@ -1,16 +1,17 @@
 """Score a policy in closed loop: `python -m lala_jax.evaluate --checkpoint=runs/tower/checkpoints --split=test --episodes=100`.
 
-The config comes from the checkpoint; `--config.camera.preset=paper` and the like change it. The agents that need no training are
-scored with `--config=configs/tower.py --agent=oracle` or `--agent=blind`.
+The config comes from the checkpoint; `--config.camera.preset=paper` and the like change it. `--checkpoint=pretrained/tower` repeats the
+reported score of the weights that ship with the package, and ends with status 1 where it comes out outside the reported interval. The
+agents that need no training are scored with `--config=configs/tower.py --agent=oracle` or `--agent=blind`.
 """
 
 from __future__ import annotations
 
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from lala_jax import build, checkpoint, options, scoring
+from lala_jax import build, options, pretrained, scoring, writers
 
 NO_CHECKPOINT = "give --checkpoint=PATH, or --config=FILE.py with --agent=oracle or --agent=blind"
 
@@ -41,14 +42,26 @@ def main(config, workdir, *, checkpoint: str, agent: str, split: str, start: int
         seeds=seeds,
         source=checkpoint or None,
     )
+    if agent == "policy" and not reproduced(checkpoint, config, split=split, seeds=seeds, result=result):
+        raise SystemExit(1)
     return result
 
 
+def reproduced(path: str, config, *, split: str, seeds: Sequence[int], result: Mapping[str, Any]) -> bool:
+    """Print how the score compares with the one that published weights report; False only where it contradicts that."""
+    card = pretrained.card(path)
+    if card is None:
+        return True
+    fine, text = pretrained.verdict(card, writers.plain(options.to_dict(config)), split=split, seeds=seeds, result=result)
+    print(text, flush=True)
+    return fine
+
+
 def stored_config(flags: Mapping[str, Any]):
-    """Give the config that a checkpoint holds."""
+    """Give the config that a checkpoint, or a card of published weights, holds."""
     if not flags["checkpoint"]:
         raise options.OptionsError(NO_CHECKPOINT)
-    return options.from_dict(checkpoint.describe(flags["checkpoint"])["config"])
+    return options.from_dict(pretrained.describe(flags["checkpoint"])["config"])
 
 
 if __name__ == "__main__":

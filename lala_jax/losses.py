@@ -64,7 +64,7 @@ def place_label(state: types.State, index: jax.Array, pick_xy: jax.Array) -> Pla
 
 def quarter_label(state: types.State, index: jax.Array, pick_xy: jax.Array) -> PlaceLabel:
     """Give the places of `pick_xy` with object `index` at its goal, turned by 0..3 quarters; `valid` marks the turns that look alike."""
-    turns = jnp.arange(4) * (math.pi / 2)
+    turns = jnp.arange(4) * (math.pi / 2) + 0 * state.symmetry[index]  # no number where the symmetry is none: the loss must say so
     xy, yaw = _at_goal(state, index, pick_xy, turns)
     off = turns / state.symmetry[index]
     return PlaceLabel(xy=xy, yaw=yaw, valid=jnp.abs(off - jnp.round(off)) < 1e-3)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -139,11 +140,44 @@ def erring_agent(task: base.Task, scenes: Sequence[types.Scene], seeds: Sequence
     return agent
 
 
+def half_width(values: Sequence[float] | np.ndarray) -> float:
+    """Give half the width of the normal 95% interval of the mean of `values`, NaN for fewer than two."""
+    return 1.96 * float(np.std(values, ddof=1)) / math.sqrt(len(values)) if len(values) > 1 else math.nan
+
+
+def first_failure(causes: Sequence[str]) -> str:
+    """Give the first of an episode's `causes` that is not "right", "none" where there is none."""
+    return next((cause for cause in causes if cause != "right"), "none")
+
+
+def lost_objects(episode: Episode) -> list[str]:
+    """Say of every wanted object that is not placed at the end the cause of the last action that picked, moved or unplaced it.
+
+    "never moved" where there is none. What ends more than `oracle.PLANAR` from where it was has been moved.
+    """
+    found = []
+    for index in np.flatnonzero(oracle.wanted(episode.scene) & ~episode.placed[-1]):
+        last = "never moved"
+        for number, (cause, outcome) in enumerate(zip(episode.causes, episode.outcomes, strict=True)):
+            (before, was), (after, still) = ((episode.poses[t][index], episode.placed[t][index]) for t in (number, number + 1))
+            moved = np.linalg.norm(np.subtract(after[:3], before[:3])) > oracle.PLANAR
+            if outcome.object == index or moved or (was and not still):
+                last = cause
+        found.append(last)
+    return found
+
+
 def summary(episodes: Sequence[Episode]) -> dict:
-    """Sum up scores: mean with a 95% interval, complete rate, actions by cause, failed picks by reason, and each episode's line."""
+    """Sum up scores: mean with a 95% interval, complete rate, what happened, and each episode's line.
+
+    `first_failures` counts the incomplete episodes by what first went wrong (`first_failure`), `lost_objects` the objects that are not
+    where they belong by what last happened to each (`lost_objects`), `failures_by_reason` the actions that could not be carried out.
+    """
     scores = np.array([episode.score for episode in episodes])
-    half = 1.96 * scores.std(ddof=1) / np.sqrt(len(scores)) if len(scores) > 1 else float("nan")
+    half = half_width(scores)
     causes = collections.Counter(cause for episode in episodes for cause in episode.causes)
+    first = collections.Counter(first_failure(episode.causes) for episode in episodes if not episode.complete)
+    lost = collections.Counter(cause for episode in episodes for cause in lost_objects(episode))
     reasons = collections.Counter(outcome.reason for episode in episodes for outcome in episode.outcomes if not outcome.ok)
     return {
         "episodes": len(episodes),
@@ -152,6 +186,8 @@ def summary(episodes: Sequence[Episode]) -> dict:
         "complete_percent": 100.0 * float(np.mean([episode.complete for episode in episodes])),
         "actions": int(sum(len(episode.actions) for episode in episodes)),
         "actions_by_cause": {cause: causes[cause] for cause in CAUSES},
+        "first_failures": {cause: first[cause] for cause in (*CAUSES[1:], "none")},
+        "lost_objects": {cause: lost[cause] for cause in (*CAUSES, "never moved")},
         "failures_by_reason": dict(reasons),
         "per_episode": [
             {"seed": e.seed, "score": e.score, "complete": e.complete, "actions": len(e.actions), "causes": e.causes} for e in episodes

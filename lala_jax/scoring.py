@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import functools
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lala_jax import build, checkpoint, observe, options, pictures, policy, rollout, types, writers
+from lala_jax import build, checkpoint, observe, options, pictures, policy, pretrained, rollout, types, writers
 
 AGENTS = ("policy", "oracle", "blind")
+FAILURES = 3  # failed episodes that are drawn
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -36,57 +37,69 @@ def act_batch(agent: policy.Policy, params: Any, current: types.TopDownMap, goal
     return jax.lax.map(lambda maps: agent.act(params, *maps), (current, goal))
 
 
+@jax.jit
+def _take(tree: Any, index: jax.Array) -> Any:
+    return jax.tree.map(lambda leaf: leaf[index], tree)
+
+
 class PolicyAgent:
     """A policy as a `rollout.Agent` over up to `parallel` episodes: pads to one shape, so that there is one compilation."""
 
-    def __init__(
-        self,
-        agent: policy.Policy,
-        params: Any,
-        observer: observe.Observer,
-        scenes: Sequence[types.Scene],
-        *,
-        parallel: int,
-        key,
-        keep: int = 0,
-    ):
-        self._agent, self._params, self._observer, self._key = agent, params, observer, key
-        self.keep = keep  # the heat maps of so many episodes, the first ones, are kept
+    def __init__(self, agent: policy.Policy, params: Any, observer: observe.Observer, scenes: Sequence[types.Scene], *, parallel: int, key):
+        self.observer, self._agent, self._params, self._parallel = observer, agent, params, parallel
         padded = [*scenes, *[scenes[0]] * (parallel - len(scenes))]
         self._scenes = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *padded)
-        self._key, key = jax.random.split(self._key)
+        self._key, key = jax.random.split(key)
         self.rig = mount_batch(observer, key, self._scenes) if observer.moves else None
-        self._goal = self._look(self._scenes.goal)
-        self.seen: list[policy.Heatmaps] = []  # per step, leaves [keep, ...]
+        self.goal = self._look(self._scenes, self._scenes.goal, self.rig)  # leaves [parallel, ...]
 
-    def _look(self, poses):
+    def _look(self, scenes, poses, rig):
         self._key, key = jax.random.split(self._key)
-        return observe_batch(self._observer, self._scenes, poses, key, self.rig)
+        return observe_batch(self.observer, scenes, poses, key, rig)
+
+    def _think(self, indices, poses):
+        """Look at up to `parallel` moments of these episodes and act in them: maps, actions and logits `[parallel, ...]`, padding last."""
+        index = np.resize(indices, self._parallel)
+        poses = np.resize(poses, (self._parallel, *np.shape(poses)[1:]))
+        scenes, rig, goal = _take((self._scenes, self.rig, self.goal), index)
+        current = self._look(scenes, jnp.asarray(poses, jnp.float32), rig)
+        return current, *act_batch(self._agent, self._params, current, goal)
 
     def __call__(self, indices: Sequence[int], poses: np.ndarray) -> list[types.PickPlace]:
-        every = np.array(self._scenes.start)
-        every[list(indices)] = poses
-        action, heat = act_batch(self._agent, self._params, self._look(jnp.asarray(every, jnp.float32)), self._goal)
-        if self.keep:
-            self.seen.append(jax.device_get(jax.tree.map(lambda leaf: leaf[: self.keep], heat)))
-        action = jax.device_get(action)
-        return [jax.tree.map(lambda leaf: leaf[i], action) for i in indices]  # noqa: B023
+        action = jax.device_get(self._think(indices, poses)[1])
+        return [jax.tree.map(lambda leaf: leaf[i], action) for i in range(len(indices))]  # noqa: B023
+
+    def think_again(self, moments: Sequence[tuple[int, np.ndarray]]) -> Iterator[tuple[types.TopDownMap, policy.Heatmaps]]:
+        """Give what is seen and thought at each of `moments`, an episode's index and the object poses `[N, 7]`; noise is drawn afresh."""
+        for start in range(0, len(moments), self._parallel):
+            batch = moments[start : start + self._parallel]
+            current, _, heat = jax.device_get(self._think([index for index, _ in batch], np.stack([poses for _, poses in batch])))
+            for i in range(len(batch)):
+                yield jax.tree.map(lambda leaf: leaf[i], (current, heat))  # noqa: B023
 
 
 def evaluate(
     agent: policy.Policy, params: Any, observer: observe.Observer, *, seeds: Sequence[int], parallel: int, threads: int, strips: int = 0,
     seed: int = 0, progress=None,
-) -> tuple[dict[str, Any], list[np.ndarray]]:  # fmt: skip
-    """Run the closed loop on `seeds` with the real primitive: `(rollout.summary, pictures of the first episodes)`."""
-    task, episodes, drawn = observer.task, [], []
+) -> tuple[dict[str, Any], dict[tuple[str, int], np.ndarray]]:  # fmt: skip
+    """Run the closed loop on `seeds` with the real primitive: `(rollout.summary, pictures)`.
+
+    The first `strips` episodes are drawn, as `("episode", 0)` and so on, and, where any are, the first `FAILURES` that score below 100,
+    as `("failure", 0)` and so on.
+    """
+    task, episodes, drawn, failed = observer.task, [], {}, 0
     for start in range(0, len(seeds), parallel):
         chunk = list(seeds[start : start + parallel])
         scenes = [task.sample(s) for s in chunk]
-        key = jax.random.fold_in(jax.random.key(seed), start)
-        actor = PolicyAgent(agent, params, observer, scenes, parallel=parallel, key=key, keep=min(strips - len(drawn), len(chunk)))
+        actor = PolicyAgent(agent, params, observer, scenes, parallel=parallel, key=jax.random.fold_in(jax.random.key(seed), start))
         done = rollout.run(task, scenes, chunk, actor, threads=threads)
-        for i in range(actor.keep):
-            drawn.append(episode_picture(observer, done[i], [jax.tree.map(lambda leaf: leaf[i], heat) for heat in actor.seen]))  # noqa: B023
+        names = {("episode", start + i): i for i in range(min(strips - start, len(done)))}
+        if strips:
+            lost = [i for i, episode in enumerate(done) if episode.score < 100.0][: FAILURES - failed]
+            names |= {("failure", failed + n): i for n, i in enumerate(lost)}
+            failed += len(lost)
+        strip = episode_pictures(actor, {i: done[i] for i in names.values()})
+        drawn |= {name: strip[i] for name, i in names.items()}
         episodes += done
         if progress is not None:
             progress(len(episodes), len(seeds))
@@ -101,56 +114,62 @@ def baseline(name: str, observer_task, *, seeds: Sequence[int], threads: int) ->
     return rollout.summary(rollout.run(observer_task, scenes, seeds, agent, threads=threads))
 
 
-def episode_picture(observer: observe.Observer, episode: rollout.Episode, heats: Sequence[policy.Heatmaps]) -> np.ndarray:
-    """Draw an episode as a strip: views, maps, heat and action of every step, the end beside the goal.
+def episode_pictures(actor: PolicyAgent, episodes: Mapping[int, rollout.Episode]) -> dict[int, np.ndarray]:
+    """Draw episodes of `actor`, by their indices, as strips: views, maps, heat and action of every step, the end beside the goal.
 
-    `heats` may be longer than the episode: other episodes of the batch went on.
+    The policy thinks again from the recorded poses; the actions are the recorded ones.
     """
-    scene = episode.scene
+    moments = [(index, poses) for index, episode in episodes.items() for poses in episode.poses[: len(episode.actions)]]
+    thoughts = actor.think_again(moments)
+    return {index: _strip(actor, index, episode, thoughts) for index, episode in episodes.items()}
+
+
+def _strip(actor, index, episode, thoughts) -> np.ndarray:
+    observer, scene = actor.observer, episode.scene
+    layer = None if actor.rig is None else _take(actor.rig.background, index)
 
     def see(poses):
-        return _look(observer, scene.size, scene.color, scene.base, jnp.asarray(poses, jnp.float32))
+        return _views(observer, scene.size, scene.color, scene.base, jnp.asarray(poses, jnp.float32), layer)
 
-    goal_views, goal_map = see(scene.goal)
+    goal_views, goal_map = see(scene.goal), _take(actor.goal, index)
     panels = []
-    for number, (heat, action) in enumerate(zip(heats, episode.actions, strict=False)):
-        views, current = see(episode.poses[number])
-        caption = f"step {number + 1}: {episode.causes[number]} ({episode.outcomes[number].reason})"
+    for number, (action, cause, outcome) in enumerate(zip(episode.actions, episode.causes, episode.outcomes, strict=True)):
+        current, heat = next(thoughts)
+        views, caption = see(episode.poses[number]), f"step {number + 1}: {cause} ({outcome.reason})"
         panels.append(pictures.step_panel(views, goal_views, current, goal_map, heat.pick, heat.place, action, observer.spec, caption))
-    final, _ = see(episode.poses[-1])
-    return pictures.episode_strip(panels, final, goal_views, f"{observer.task.name}, seed {episode.seed}: score {episode.score:.0f} of 100")
+    caption = f"{observer.task.name}, seed {episode.seed}: score {episode.score:.0f} of 100"
+    return pictures.episode_strip(panels, see(episode.poses[-1]), goal_views, caption)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _look(observer, size, color, base, poses):
-    maps = observer.maps(size[None], color[None], base[None], poses[None], key=jax.random.key(0))
-    return observer.views(size, color, base, poses), jax.tree.map(lambda leaf: leaf[0], maps)
+def _views(observer, size, color, base, poses, layer):
+    views = observer.views(size, color, base, poses, layer)
+    return views if observer.missing < 0 else views.replace(rgb=views.rgb.at[observer.missing].set(0.0))
 
 
 def check_checkpoint(path: str, config: Mapping[str, Any], agent: policy.Policy) -> Any:
-    """Load the averaged parameters of a checkpoint, checked against the policy that the config describes."""
+    """Load the averaged parameters of a checkpoint or of published weights, checked against the policy that the config describes."""
     template = jax.eval_shape(agent.init, jax.random.key(0))
-    stored, _, spec = checkpoint.load(path)
+    params, _, spec = pretrained.load(path)
     expected = build.input_spec(config)
     if writers.plain(spec) != writers.plain(expected):
         raise checkpoint.MismatchError(f"{path} expects the input {spec}, the config makes {expected}")
-    _check_shapes(path, stored["average"], template)
-    return jax.tree.map(jnp.asarray, stored["average"])
+    _check_shapes(path, params, template)
+    return jax.tree.map(jnp.asarray, params)
 
 
 def _check_shapes(path, params, template) -> None:
-    named = {jax.tree_util.keystr(k, simple=True, separator="/"): v.shape for k, v in jax.tree_util.tree_leaves_with_path(params)}
-    wanted = {jax.tree_util.keystr(k, simple=True, separator="/"): v.shape for k, v in jax.tree_util.tree_leaves_with_path(template)}
-    for name in sorted(wanted | named):
-        if named.get(name) != wanted.get(name):
-            there, here = named.get(name), wanted.get(name)
-            raise checkpoint.MismatchError(f"{path} is of another model: {name} is {there} there, {here} in the config")
+    there, here = ({name: leaf.shape for name, leaf in checkpoint.named(tree).items()} for tree in (params, template))
+    for name in sorted(there | here):
+        if there.get(name) != here.get(name):
+            shapes = f"{there.get(name)} there, {here.get(name)} in the config"
+            raise checkpoint.MismatchError(f"{path} is of another model: {name} is {shapes}")
 
 
 def write_scores(config, result, strips, out: pathlib.Path, *, agent: str, split: str, seeds: Sequence[int], source: str | None) -> None:
     """Write `scores-<agent>-<split>.json` and the pictures to `out`, and print the line that matters."""
-    for number, picture in enumerate(strips):
-        writers.write_image(out / f"episode-{split}-{number}.webp", picture)
+    for (kind, number), picture in dict(strips).items():
+        writers.write_image(out / f"{kind}-{split}-{number}.webp", picture)
     path = out / f"scores-{agent}-{split}.json"
     facts = {"agent": agent, "task": config.task.name, "split": split, "seeds": [seeds[0], seeds[-1]], "checkpoint": source}
     writers.write_json(path, {**facts, **result, "device": jax.devices()[0].device_kind, "config": options.to_dict(config)})

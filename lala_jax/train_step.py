@@ -50,8 +50,8 @@ def observations(recipe: Recipe, key: jax.Array, examples: types.State) -> tuple
     size = examples.color.shape[0]
     facts, color, stand = (jnp.concatenate([x, x]) for x in (examples.size, examples.color, examples.base))
     poses = jnp.concatenate([examples.poses, examples.goal])
-    observer, (key_noise, key_errors) = recipe.observer, jax.random.split(key)
-    views = observer.look(facts, color, stand, poses, key=key_noise)
+    observer, (key_noise, key_errors, key_look) = recipe.observer, jax.random.split(key, 3)
+    views = observer.look(facts, color, stand, poses, key=key_look)
     if recipe.sensors:
         pair = jax.random.split(key_errors, size)
         keys = jnp.concatenate([pair, pair]), jax.random.split(key_noise, 2 * size)

@@ -1,4 +1,6 @@
-"""Augmentation keeps what it must: colours' identity, relative poses, the map."""
+"""Augmentation keeps what it must: colours' identity, relative poses, the map; sensors err as often and as far as told."""
+
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -7,7 +9,7 @@ import pytest
 from test_losses import SPEC, on_device, state_of
 
 from lala_jax import augment, losses, train_step, types
-from lala_jax.perception import transforms
+from lala_jax.perception import camera, noise, transforms
 from lala_jax.sim import tasks
 from lala_jax.sim.tasks import base
 
@@ -108,3 +110,89 @@ def test_rigid_leaves_a_scene_that_cannot_move():
     state = state_of("tower")
     new = augment.rigid(jax.random.key(0), on_device(state), spec=SPEC, base_radius=2.0)
     np.testing.assert_allclose(new.poses, state.poses, atol=1e-6)
+
+
+@functools.cache
+def some_views():
+    """Three cameras' views of a slope, with a hole."""
+    eyes = jnp.array([[0.9, 0.3, 0.7], [0.1, 0.5, 0.7], [0.3, 0.05, 0.9]])
+    cameras = camera.pinhole(camera.look_at(eyes, jnp.array([0.5, 0.0, 0.0])), height=12, width=16, focal=20.0)
+    rng = np.random.default_rng(0)
+    depth = rng.uniform(0.5, 0.51, (3, 12, 16)) + np.linspace(0, 0.1, 16)
+    depth[:, 2, 3] = 0
+    return types.Views(rgb=jnp.asarray(rng.random((3, 12, 16, 3)), jnp.float32), depth=jnp.asarray(depth, jnp.float32), camera=cameras)
+
+
+KEYS = jax.random.split(jax.random.key(7), 300), jax.random.split(jax.random.key(8), 300)
+
+
+@functools.cache
+def erring(**errors):
+    """The views under 300 keys."""
+    see = functools.partial(augment.sensors, errors=augment.Sensors(**errors), disparity=12.0)
+    return jax.jit(jax.vmap(lambda key, key_noise: see(key, key_noise, some_views())))(*KEYS)
+
+
+def test_sensors_without_errors_change_nothing():
+    assert not augment.Sensors() and augment.Sensors(missing=0.1) and augment.Sensors(turn=0.1)
+    same = augment.sensors(KEYS[0][0], KEYS[1][0], some_views(), augment.Sensors(), disparity=12.0)
+    for name in ("rgb", "depth"):
+        np.testing.assert_array_equal(getattr(same, name), getattr(some_views(), name))
+    np.testing.assert_allclose(same.camera.world_from_cam, some_views().camera.world_from_cam, atol=1e-7)
+
+
+@pytest.mark.parametrize("share", [0.3, 1.0])
+def test_one_camera_or_none_is_missing(share):
+    """Each as often as the others, the colours untouched; what the others see stays as it is."""
+    views = erring(missing=share, shift=0.01, turn=2.0)
+    lost = np.asarray((views.depth == 0).all((2, 3)))
+    assert set(lost.sum(1)) <= {0, 1} and abs(lost.any(1).mean() - share) < 0.09  # three standard errors
+    if share == 1:
+        assert np.abs(lost.mean(0) - 1 / 3).max() < 0.09
+    kept = np.broadcast_to(np.asarray(some_views().depth), lost.shape + (12, 16))
+    np.testing.assert_array_equal(np.asarray(views.depth)[~lost], kept[~lost])
+    np.testing.assert_array_equal(views.rgb, np.broadcast_to(some_views().rgb, views.rgb.shape))
+
+
+def test_pictures_are_noisy_as_often_as_told():
+    """A picture has the noise of `noise.depth_noise` by its own key, or none; all views of a scene alike."""
+    views = erring(depth_noise=0.3)
+    noisy = jax.jit(jax.vmap(lambda key: noise.depth_noise(key, some_views().depth, disparity=12.0)))(KEYS[1])
+    is_noisy = np.isclose(views.depth, noisy, atol=1e-6).mean((1, 2, 3)) > 0.99  # rounding may move a disparity step
+    is_clean = np.asarray((views.depth == some_views().depth).all((1, 2, 3)))
+    assert (is_noisy ^ is_clean).all() and abs(is_noisy.mean() - 0.3) < 0.08
+
+
+def test_a_key_gives_the_current_picture_and_the_goal_the_same_cameras():
+    """The noise's key has no say in where the cameras are believed, which one is missing, nor in whether there is noise."""
+    errors = augment.Sensors(depth_noise=0.5, shift=0.01, turn=1.0, missing=0.5)
+    see = jax.jit(lambda key, key_noise: augment.sensors(key, key_noise, some_views(), errors, disparity=12.0))
+    kinds = set()
+    for number in range(12):
+        now, goal = (see(KEYS[0][number], KEYS[1][number + other]) for other in (0, 100))
+        np.testing.assert_array_equal(now.camera.world_from_cam, goal.camera.world_from_cam)
+        lost, clean = ([np.asarray(how(v.depth)) for v in (now, goal)] for how in (blind, lambda d: clean_views(d).any()))
+        np.testing.assert_array_equal(*lost)
+        assert clean[0] == clean[1] and (clean[0] or not np.array_equal(now.depth, goal.depth))
+        kinds.add((bool(lost[0].any()), bool(clean[0])))
+        off = np.asarray(now.camera.world_from_cam - some_views().camera.world_from_cam)[:, :3, 3]
+        assert 0 < np.linalg.norm(off, axis=-1).max() <= 0.01 + 1e-6
+    assert len(kinds) == 4, "missing and not, noisy and not"
+    assert not np.array_equal(see(KEYS[0][0], KEYS[1][0]).camera.world_from_cam, see(KEYS[0][1], KEYS[1][0]).camera.world_from_cam)
+
+
+def blind(depth):
+    return (depth == 0).all((1, 2))
+
+
+def clean_views(depth):
+    return (depth == some_views().depth).all((1, 2))
+
+
+def test_believed_cameras_move_within_bounds():
+    cameras = erring(missing=1.0, shift=0.01, turn=2.0).camera
+    before, after = np.asarray(some_views().camera.world_from_cam, float), np.asarray(cameras.world_from_cam, float)
+    far = np.linalg.norm(after[..., :3, 3] - before[:, :3, 3], axis=-1)
+    turns = after[..., :3, :3] @ np.swapaxes(before[:, :3, :3], -1, -2)
+    angle = np.degrees(np.arccos(np.clip((np.trace(turns, axis1=-2, axis2=-1) - 1) / 2, -1, 1)))
+    assert 0.0095 < far.max() <= 0.01 + 1e-6 and 1.9 < angle.max() <= 2.0 + 1e-2

@@ -73,6 +73,74 @@ def test_place_label_brings_the_object_to_its_goal(name):
             assert abs(float(transforms.wrap_angle(off, float(state.symmetry[index])))) < 1e-4
 
 
+pick_valid = jax.jit(losses.pick_valid, static_argnames=("spec", "share"))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.5, 0.9])
+@pytest.mark.parametrize("name", ["tower", "pallet"])
+def test_a_share_of_the_face_is_part_of_it_and_about_its_middle(name, share):
+    """Never empty for a face that is seen whole, whatever its yaw; a cell is in it exactly where a slow look finds it near the middle."""
+    centres = np.asarray(losses.cell_centres(SPEC))
+    for seed in range(4):
+        state = on_device(state_of(name, seed))
+        middle, whole = np.asarray(pick_valid(state, spec=SPEC, share=share)), np.asarray(pick_valid(state, spec=SPEC))
+        assert middle.any((1, 2)).all()
+        for index, (pose, size) in enumerate(zip(np.asarray(state.poses, float), np.asarray(state.size, float), strict=True)):
+            cells = np.argwhere(whole[index] | middle[index])
+            points = np.column_stack([centres[tuple(cells.T)], np.full(len(cells), pose[2])])
+            local = np.abs(transforms.apply_pose(transforms.pose_inverse(pose), points)[:, :2])
+            most = np.maximum(share * (size[:2] / 2 - losses.PICK_MARGIN), 0.71 * SPEC.cell)
+            clear = (np.abs(local - most) > 1e-5).all(-1)
+            np.testing.assert_array_equal(middle[index][tuple(cells.T)][clear], (local < most).all(-1)[clear])
+            if share * (size[:2] / 2 - losses.PICK_MARGIN).min() > 0.71 * SPEC.cell:
+                assert not (middle[index] & ~whole[index]).any()
+
+
+def test_a_share_is_part_of_the_whole_where_cells_are_small():
+    """At the cells that agents use, the middle half of a face lies in its right picks, on every object; and shares are nested."""
+    spec = types.MapSpec(cell=0.00625)
+    state = on_device(state_of("pallet"))
+    masks = [np.asarray(pick_valid(state, spec=spec, share=share)) for share in (0.2, 0.5, 0.8, 1.0)]
+    for inner, outer in zip(masks, masks[1:], strict=False):
+        assert not (inner & ~outer).any() and (inner.sum((1, 2)) <= outer.sum((1, 2))).all()
+    assert masks[0].any((1, 2)).all() and masks[1].sum() < 0.5 * masks[3].sum()
+
+
+@pytest.mark.parametrize("name", ["tower", "pallet"])
+def test_quarter_label_equals_place_label_for_the_turns_that_look_alike(name):
+    state = on_device(state_of(name, seed=5))
+    squares = 0
+    for index in range(len(state.size)):
+        pick = state.poses[index, :2] + jnp.array([0.007, -0.004])
+        quarter, label = losses.quarter_label(state, jnp.int32(index), pick), losses.place_label(state, jnp.int32(index), pick)
+        count = round(2 * math.pi / float(state.symmetry[index]))
+        squares += count == 4
+        assert np.asarray(quarter.valid).tolist() == [True, count == 4, True, count == 4]
+        for field in ("xy", "yaw"):
+            alike, given = np.asarray(getattr(quarter, field))[:: 4 // count], np.asarray(getattr(label, field))[:count]
+            off = transforms.wrap_angle(alike - given) if field == "yaw" else alike - given
+            np.testing.assert_allclose(off, 0, atol=1e-5)
+    assert squares == (len(state.size) if name == "tower" else 0)
+
+
+def test_quarter_label_brings_the_object_to_its_goal_turned_by_quarters():
+    """The box's corners land on those of its goal, turned by the quarter about the goal's middle."""
+    state = state_of("pallet", seed=5)
+    corners = np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]]) / 2
+    for index in range(len(state.size)):
+        pose, goal, size = (np.asarray(leaf[index], float) for leaf in (state.poses, state.goal, state.size))
+        pick = pose[:2] + np.array([-0.006, 0.011])
+        label = losses.quarter_label(on_device(state), jnp.int32(index), jnp.asarray(pick, jnp.float32))
+        frame = [np.append(p[:2], transforms.yaw_from_quat(p[3:])) for p in (pose, goal)]
+        now = transforms.apply_se2(frame[0], corners * size[:2])
+        for quarter, (xy, yaw) in enumerate(zip(np.asarray(label.xy), np.asarray(label.yaw), strict=True)):
+            moved = transforms.apply_se2(np.array([*xy, yaw]), now - pick)  # the picked point lands at xy, all turned about it
+            wanted = transforms.apply_se2(frame[1] + np.array([0, 0, quarter * np.pi / 2]), corners * size[:2])
+            np.testing.assert_allclose(moved, wanted, atol=2e-5)
+    lone = on_device(state).replace(symmetry=jnp.full(8, 2 * math.pi))
+    assert np.asarray(losses.quarter_label(lone, jnp.int32(0), lone.poses[0, :2]).valid).tolist() == [True, False, False, False]
+
+
 def test_place_index_masks_what_leaves_the_map():
     state = state_of()
     label = losses.place_label(on_device(state), jnp.int32(0), jnp.asarray(state.poses[0, :2]))

@@ -1,4 +1,7 @@
-"""From poses to maps: what the fused map shows is what the scene is."""
+"""From poses to maps: what the fused map shows is what the scene is, also where the cameras are not where they should be."""
+
+import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -77,3 +80,143 @@ def test_the_arm_at_home_is_in_the_background():
 def test_unknown_preset_names_the_choices():
     with pytest.raises(ValueError, match="paper, ring"):
         observer(preset="rnig").check()
+
+
+TOWER = observe.Observer(tasks.get("tower", num_objects=2), SPEC, height=240, width=320)
+MOVED = dataclasses.replace(TOWER, shift=0.03, turn=3.0, calibrate=True)
+CUBE = 0.04
+PLACES = np.array([[[0.4137, -0.2391], [0.5713, 0.1127]], [[0.3311, -0.3207], [0.6289, 0.2583]]])  # of two cubes in two scenes
+
+
+@functools.cache
+def cubes():
+    """Two scenes of two cubes, their sides along the axes, and the stand far away: `size`, `color`, `base`, `poses`."""
+    base = np.array([[0.3, 0.4, 0.0025, 1, 0, 0, 0]] * 2)
+    poses = np.concatenate([PLACES, np.full((2, 2, 1), CUBE / 2), np.tile([1.0, 0, 0, 0], (2, 2, 1))], -1)
+    color = np.tile([[0.9, 0.1, 0.1], [0.1, 0.2, 0.9]], (2, 1, 1))
+    return tuple(jnp.asarray(leaf, jnp.float32) for leaf in (np.full((2, 2, 3), CUBE), color, base, poses))
+
+
+@functools.cache
+def plain_views():
+    """What the preset's cameras see."""
+    return jax.jit(TOWER.look)(*cubes())
+
+
+fuse = jax.jit(topdown.from_views, static_argnames="spec")
+
+
+def fused(views, index=0, spec=SPEC):
+    return jax.device_get(fuse(jax.tree.map(lambda leaf: leaf[index], views), spec=spec))
+
+
+def test_the_skin_tells_where_a_cubes_edges_are():
+    """To about a millimetre with cells of 6.25: by how far the cells at either end of the lines through a cube are filled."""
+    spec = types.MapSpec(cell=0.00625)
+    errors = []
+    for index in range(2):
+        seen = fused(plain_views(), index, spec)
+        on_top = np.abs(seen.height - CUBE) < 0.003
+        share = 1 - 2 * np.abs(seen.skin)
+        for middle in PLACES[index]:
+            cell = np.asarray(types.index_from_world(spec, middle))
+            for axis in (0, 1):
+                lines = np.arange(-2, 3) + cell[1 - axis]
+                high, part = (np.take(leaf, lines, 1 - axis) for leaf in (on_top, share[..., axis]))
+                ends = []
+                for number in range(len(lines)):
+                    one, filled = (np.take(leaf, number, 1 - axis) for leaf in (high, part))
+                    first, last = np.flatnonzero(one & (np.abs(np.arange(len(one)) - cell[axis]) < 6))[[0, -1]]
+                    ends.append([first + 1 - filled[first], last + filled[last]])
+                edges = (spec.y[0], spec.x[0])[axis] + np.mean(ends, 0) * spec.cell
+                errors.append(edges - middle[1 - axis] - np.array([-CUBE / 2, CUBE / 2]))
+    assert np.abs(errors).max() < 1.3e-3 and np.abs(errors).mean() < 8e-4
+
+
+def test_a_camera_that_sees_nothing_adds_no_points():
+    """The map is that of the other three; all four give more."""
+    lost = jax.jit(dataclasses.replace(TOWER, missing=2).maps)(*cubes())
+    others = jax.tree.map(lambda leaf: leaf[:, jnp.array([0, 1, 3])], plain_views())
+    for index in range(2):
+        three, one = fused(others, index), jax.tree.map(lambda leaf, index=index: leaf[index], lost)
+        assert np.abs(three.count - one.count).sum() <= 4, "a point on a cell's border may round either way"
+        np.testing.assert_allclose(three.height, one.height, atol=1e-5)
+        assert three.count.sum() < 0.9 * fused(plain_views(), index).count.sum()
+
+
+def test_moving_cameras_need_a_rig():
+    for options in ({"shift": 0.01}, {"turn": 1.0}, {"calibrate": True}):
+        with pytest.raises(ValueError, match="needs the rig of Observer.mount"):
+            observer(**options).maps(*(leaf[:1] for leaf in cubes()))
+    assert not observer().moves and not observer(missing=1, depth_noise=True).moves
+
+
+@functools.cache
+def mounted():
+    """A rig, the maps through it, and those of one who does not know that the cameras have moved."""
+
+    @jax.jit
+    def everything(key, *scenes):
+        rig = MOVED.mount(key, *scenes)
+        nominal = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (2, *leaf.shape)), MOVED.camera)
+        return rig, MOVED.maps(*scenes, rig=rig), MOVED.maps(*scenes, rig=rig.replace(believed=nominal))
+
+    return jax.device_get(everything(jax.random.key(3), *cubes()))
+
+
+def off(camera, true):
+    """How far, in metres, points of the workspace's table land from where they are if unprojected with a camera's pose `[E, V]`."""
+    corners = np.array([[x, y, 0.0, 1.0] for x in (0.25, 0.5, 0.75) for y in (-0.5, 0.0, 0.5)])
+    wrong = np.asarray(camera.world_from_cam, float) @ np.linalg.inv(np.asarray(true.world_from_cam, float))
+    return np.linalg.norm((corners @ np.swapaxes(wrong, -1, -2) - corners)[..., :3], axis=-1).max(-1)
+
+
+def test_mounted_cameras_have_moved_and_are_found():
+    rig, _, _ = mounted()
+    nominal = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (2, *leaf.shape)), MOVED.camera)
+    shift = np.linalg.norm(rig.camera.world_from_cam[..., :3, 3] - nominal.world_from_cam[..., :3, 3], axis=-1)
+    assert (shift <= 0.03 + 1e-6).all() and shift.max() > 0.01 and len(np.unique(shift.round(6))) == 8, "every camera on its own"
+    assert np.median(off(nominal, rig.camera)) > 0.01
+    assert off(rig.believed, rig.camera).max() < 1e-3
+    assert rig.background.depth.shape == (2, 4, 240, 320)
+
+
+def tops(seen, index):
+    """The middle `[2, 2]` of what is as high as a cube near each cube's place; NaN where there is nothing."""
+    centres = np.asarray(losses.cell_centres(SPEC))
+    middles = []
+    for place in PLACES[index]:
+        high = (np.abs(seen.height[index] - CUBE) < 0.004) & (np.abs(centres - place).max(-1) < 0.06)
+        middles.append(centres[high].mean(0) if high.any() else np.full(2, np.nan))
+    return np.array(middles)
+
+
+def test_the_map_of_found_cameras_is_that_of_cameras_that_did_not_move():
+    """A cube's top is within a fraction of a cell of where it is, nearly all heights are right; not so for one who was not told."""
+    _, found, deceived = mounted()
+    for index in range(2):
+        still = fused(plain_views(), index)
+        mine = jax.tree.map(lambda leaf, index=index: leaf[index], found)
+        np.testing.assert_allclose(tops(found, index), PLACES[index], atol=0.4 * SPEC.cell)
+        assert not np.allclose(tops(deceived, index), PLACES[index], atol=SPEC.cell)
+        both = (still.count.sum(-1) > 3) & (mine.count.sum(-1) > 3)
+        assert both.mean() > 0.9
+        assert (np.abs(still.height - mine.height)[both] < 0.002).mean() > 0.98
+        assert (np.abs(still.height - deceived.height[index])[both] < 0.002).mean() < 0.5
+
+
+def test_calibration_alone_leaves_still_cameras_where_they_are():
+    still = dataclasses.replace(TOWER, calibrate=True)
+    rig = jax.device_get(jax.jit(still.mount)(jax.random.key(0), *cubes()))
+    assert rig.background is None
+    nominal = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (2, *leaf.shape)), still.camera)
+    np.testing.assert_allclose(rig.camera.world_from_cam, nominal.world_from_cam, atol=1e-6)
+    assert off(rig.believed, nominal).max() < 2e-4
+
+
+def test_without_calibration_the_preset_is_believed():
+    """Where the cameras are is drawn by the key alone, whatever the pictures' size."""
+    naive = dataclasses.replace(MOVED, height=24, width=32, calibrate=False)
+    rig = jax.device_get(jax.jit(naive.mount)(jax.random.key(3), *cubes()))
+    np.testing.assert_allclose(rig.camera.world_from_cam, mounted()[0].camera.world_from_cam, atol=1e-6)
+    np.testing.assert_allclose(rig.believed.world_from_cam, np.broadcast_to(naive.camera.world_from_cam, (2, 4, 4, 4)), atol=1e-7)

@@ -19,9 +19,8 @@ def views(count=4, height=24, width=32, color=RED):
 
 def empty_map(channels=3):
     shape = (SPEC.rows, SPEC.cols, SPEC.slices)
-    return types.TopDownMap(
-        features=np.zeros((*shape, channels), np.float32), count=np.zeros(shape, np.float32), height=np.zeros(shape[:2], np.float32)
-    )
+    sizes = {"features": (*shape, channels), "count": shape, "offset": (*shape, 2), "height": shape[:2], "skin": (*shape[:2], 2)}
+    return types.TopDownMap(**{name: np.zeros(size, np.float32) for name, size in sizes.items()})
 
 
 def action(pick=(0.4, -0.2, 0.04), place=(0.6, 0.3, 0.1), yaw=0.5):

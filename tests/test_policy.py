@@ -1,5 +1,7 @@
 """Policies on scenes fused from the boxes' own surfaces: what is asked is drawn right, actions are sane, one batch is learnt by heart."""
 
+import collections.abc
+import dataclasses
 import functools
 import math
 
@@ -28,14 +30,17 @@ POLICIES = {"goal_aware": policy.GoalAwarePolicy(model=GOAL_AWARE)} | {
 }
 
 
-def state_of(seed, *, objects=2, done=0):
-    """A tower scene with its first `done` cubes placed."""
+def state_of(seed, *, objects=2, done=0, sides=None):
+    """A tower scene with its first `done` cubes placed; the others have `sides` (metres) in x and y if given, and fit one way."""
     task = tasks.get("tower", num_objects=objects)
     scene = task.sample(seed)
     poses = np.where(np.arange(objects)[:, None] < done, scene.goal, scene.start)
     fields = {field: getattr(scene, field) for field in ("size", "color", "base", "goal", "symmetry")}
     placed, ready = oracle.placed(task, scene, poses), oracle.ready(task, scene, poses)
     assert placed.sum() == done and ready.sum() == (done < objects)
+    if sides is not None:
+        fields["size"] = np.where(np.arange(objects)[:, None] < done, scene.size, [*sides, scene.size[0, 2]])
+        fields["symmetry"] = np.where(np.arange(objects) < done, scene.symmetry, math.pi)
     return jax.tree.map(jnp.asarray, types.State(**fields, poses=poses, placed=placed, ready=ready))
 
 
@@ -100,6 +105,22 @@ def test_draw_marks_the_picks_of_what_is_ready():
         assert sample.valid.sum() == 4 and len(set(sample.bins[sample.valid].tolist())) == 4
 
 
+def test_draw_teaches_picks_about_the_middle_of_a_face():
+    """What is taught is some of what is right, near the ready object's middle; the drawn pick may be anywhere that is right."""
+    state = state_of(0, objects=3, done=1, sides=(0.07, 0.06))
+    far = 0.0
+    for sample in draws(state, ~np.asarray(state.placed), multi_action=True):
+        assert sample.pick_best.any() and not (sample.pick_best & ~sample.pick_valid).any()
+        assert sample.pick_best.sum() < 0.6 * sample.pick_valid.sum()
+        cells = np.argwhere(sample.pick_best)
+        points = np.column_stack([np.asarray(types.world_from_index(SPEC, cells)), np.full(len(cells), state.poses[1, 2])])
+        local = transforms.apply_pose(transforms.pose_inverse(np.asarray(state.poses[1], float)), points)
+        assert (np.abs(local[:, :2]) < np.maximum((np.array([0.035, 0.03]) - 0.009) * policy.MIDDLE, 0.71 * SPEC.cell) + 1e-5).all()
+        middle = np.asarray(state.poses[sample.index, :2])
+        far = max(far, float(np.linalg.norm(np.asarray(types.world_from_index(SPEC, sample.pick)) - middle)))
+    assert far > 0.013
+
+
 def test_draw_of_nothing_is_said():
     state = state_of(0, objects=3, done=1)
     for sample in draws(state, [False, False, False], multi_action=True, count=3):
@@ -109,7 +130,7 @@ def test_draw_of_nothing_is_said():
 def test_one_hot_marks_one_pick_and_the_place_of_least_turn():
     state = state_of(0, objects=3, done=1)
     for sample in draws(state, state.ready, multi_action=False):
-        assert np.argwhere(sample.pick_valid).tolist() == [sample.pick.tolist()]
+        assert np.argwhere(sample.pick_valid).tolist() == np.argwhere(sample.pick_best).tolist() == [sample.pick.tolist()]
         assert sample.valid.sum() == 1
         off = np.abs(transforms.wrap_angle(sample.place.yaw))
         assert off[sample.valid][0] == off.min() <= math.pi / 4 + 1e-5
@@ -161,6 +182,190 @@ def test_goal_aware_acts_on_the_surface_inside_the_map():
     check_action(POLICIES["goal_aware"], *jax.device_get(act(params, current, goal)), current)
 
 
+@dataclasses.dataclass(frozen=True)
+class Canned:
+    """A network that answers what it is told: logits as given, and a refinement that a function decides."""
+
+    place: tuple  # ((turn, row, col), logit), ...
+    refine: collections.abc.Callable  # of pick, cell and turn: offset [3] and fit
+    spec: types.MapSpec = SPEC
+    rotations: int = ROTATIONS
+    matching: bool = True
+    pick: tuple = (30, 12)
+
+    def apply(self, variables, *inputs, method):
+        del variables
+        if method == "match":
+            height = jnp.zeros((SPEC.rows, SPEC.cols))
+            return canned_match(pick=height.at[self.pick].set(1.0))
+        if method == "place":
+            logits = jnp.zeros((self.rotations, SPEC.rows, SPEC.cols))
+            for at, value in self.place:
+                logits = logits.at[at].set(value)
+            return goal_aware.Place(logits=logits)
+        return self.refine(*inputs[2:]) if method == "refine" else None
+
+
+def canned_match(pick):
+    nothing = jnp.zeros((0, 3))
+    return goal_aware.Match(pick=pick, current=nothing, token=nothing, token_valid=nothing, token_embedding=nothing, token_next=nothing)
+
+
+def still(pick, cell, turn):
+    """A refinement that is content with every guess, and likes none better."""
+    del pick, cell, turn
+    return jnp.zeros(3), jnp.float32(0)
+
+
+@pytest.mark.parametrize("rotations", [12, 36, 10])
+def test_guesses_equal_a_loop(rotations):
+    """The best place, and per quarter turn the best within 3 cm of it, a bin more or less."""
+    agent = policy.GoalAwarePolicy(model=Canned((), still))
+    guesses = jax.jit(agent._guesses)
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        logits = rng.normal(size=(rotations, 30, 20)).astype(np.float32)
+        best = tuple(rng.integers(0, (rotations, 30, 20)))
+        logits[best] = 9.0
+        cells, turns = map(np.asarray, guesses(jnp.asarray(logits)))
+        assert (turns[0], *cells[0]) == best and cells.shape == (4, 2) and turns.dtype == np.int32
+        for quarter in (1, 2, 3):
+            near = []
+            for turn in ((best[0] + round(quarter * rotations / 4) + more) % rotations for more in (-1, 0, 1)):
+                for row in range(max(0, best[1] - 2), min(30, best[1] + 3)):  # two cells of 12.5 mm are within 3 cm
+                    for col in range(max(0, best[2] - 2), min(20, best[2] + 3)):
+                        near.append((logits[turn, row, col], turn, row, col))
+            assert (turns[quarter], *cells[quarter]) == max(near)[1:]
+
+
+def act_canned(**answers):
+    agent = policy.GoalAwarePolicy(model=Canned(**answers))
+    blank = policy.empty_map(SPEC)
+    return jax.device_get(jax.jit(agent.act)({}, blank, blank))
+
+
+PLACES = (((1, 50, 20), 3.0), ((4, 51, 20), 2.0), ((7, 50, 21), 1.0), ((10, 49, 20), 2.5), ((6, 10, 10), 2.9))
+
+
+@pytest.mark.parametrize("quarter", [0, 1, 2, 3])
+def test_act_takes_the_quarter_turn_that_fits(quarter):
+    """The best place near the best one whose fit is best, however good another place elsewhere; the pick and the heat stay."""
+    (turn, row, col), _ = PLACES[quarter]
+
+    def fits(pick, cell, turns):
+        del pick, cell
+        return jnp.zeros(3), -jnp.abs(turns - turn)
+
+    action, heat = act_canned(place=PLACES, refine=fits)
+    np.testing.assert_allclose(action.place[:2], types.world_from_index(SPEC, np.array([row, col])), atol=1e-6)
+    assert abs(transforms.wrap_angle(action.yaw - turn * math.pi / 6)) < 1e-5
+    np.testing.assert_allclose(action.pick[:2], types.world_from_index(SPEC, np.array([30, 12])), atol=1e-6)
+    assert np.unravel_index(heat.place.argmax(), heat.place.shape) == (1, 50, 20)
+
+
+def test_act_keeps_the_best_place_where_none_fits_better():
+    action, _ = act_canned(place=PLACES, refine=still)
+    np.testing.assert_allclose(action.place[:2], types.world_from_index(SPEC, np.array([50, 20])), atol=1e-6)
+    assert abs(transforms.wrap_angle(action.yaw - math.pi / 6)) < 1e-5
+    unrefined = policy.GoalAwarePolicy(model=Canned(PLACES, lambda *_: 1 / 0), refine=False)
+    blank = policy.empty_map(SPEC)
+    again, _ = jax.jit(unrefined.act)({}, blank, blank)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), again, action)
+
+
+def test_act_refines_from_where_the_first_refinement_led():
+    """The second starts at the cell and the turn of the first: what moves halfway ends at three quarters; no step is over two cells."""
+    wanted = np.array([53.2, 18.9])
+
+    def halfway(pick, cell, turns):
+        del pick
+        off = jnp.append((wanted - (cell + 0.5)) / 2, (2.0 - turns) / 2)
+        return off, -jnp.abs(turns - 2.0)
+
+    action, _ = act_canned(place=PLACES[:1], refine=halfway)
+    first = np.array([50.5, 20.5]) + np.clip((wanted - np.array([50.5, 20.5])) / 2, -2, 2)
+    cell = np.floor(first) + 0.5
+    np.testing.assert_allclose(types.cell_from_world(SPEC, action.place[:2]), cell + (wanted - cell) / 2, atol=1e-3)
+    assert abs(transforms.wrap_angle(action.yaw - 1.75 * math.pi / 6)) < 1e-5
+    action, _ = act_canned(place=PLACES[:1], refine=lambda *_: (jnp.array([9.0, -9.0, 9.0]), jnp.float32(0)))
+    np.testing.assert_allclose(types.cell_from_world(SPEC, action.place[:2]), [54.5, 16.5], atol=1e-3)
+    assert abs(transforms.wrap_angle(action.yaw - 5 * math.pi / 6)) < 1e-5
+    action, _ = act_canned(place=(((1, 0, 39), 3.0),), refine=lambda *_: (jnp.array([-2.0, 2.0, 0.0]), jnp.float32(0)))
+    np.testing.assert_allclose(types.cell_from_world(SPEC, action.place[:2]), [0, 40], atol=1e-3)  # not off the map
+
+
+@dataclasses.dataclass(frozen=True)
+class Looking(Canned):
+    """A network whose logits are shifted sums of what it is shown, different each way round."""
+
+    place: tuple = ()
+    refine: collections.abc.Callable = still
+
+    def apply(self, variables, *inputs, method):
+        if method == "match":
+            now, goal = (one.features.sum((2, 3)) for one in inputs)
+            return canned_match(pick=jnp.roll(now, (1, 2), (0, 1)) + 2 * jnp.roll(goal, 3, 0))
+        if method == "layout":
+            return inputs
+        if method == "target":
+            return jnp.roll(inputs[0].pick, inputs[1], (0, 1))
+        if method == "place":
+            (now, goal), shown, pick = inputs
+            seen = shown + jnp.roll(now.height, 2 * pick, (0, 1))
+            return goal_aware.Place(logits=jnp.stack([jnp.roll(goal.height, k, 0) + jnp.roll(seen, k, 1) for k in range(self.rotations)]))
+        return super().apply(variables, *inputs, method=method)
+
+
+def random_map(seed):
+    rng = np.random.default_rng(seed)
+    blank = policy.empty_map(SPEC)
+    leaves = jax.tree.map(lambda leaf: jnp.asarray(rng.random(leaf.shape), jnp.float32), blank)
+    return leaves.replace(count=jnp.asarray(rng.integers(0, 3, blank.count.shape), jnp.float32))
+
+
+def test_the_mean_over_half_turns_turns_with_the_maps():
+    """Both logits are the means of two looks, so what is turned is thought turned; without the switch it is not."""
+    now, goal = random_map(0), random_map(1)
+    half = [topdown.half_turn(one) for one in (now, goal)]
+    plain, mean = (jax.jit(policy.GoalAwarePolicy(model=Looking(), average_turns=average).act) for average in (False, True))
+    action, heat = jax.device_get(mean({}, now, goal))
+    turned_action, turned_heat = jax.device_get(mean({}, *half))
+    np.testing.assert_allclose(turned_heat.pick[::-1, ::-1], heat.pick, atol=1e-5)
+    np.testing.assert_allclose(turned_heat.place[:, ::-1, ::-1], heat.place, atol=1e-5)
+    middle = np.array([0.5, 0.0])
+    for one, other in ((action.pick, turned_action.pick), (action.place, turned_action.place)):
+        np.testing.assert_allclose(one[:2] - middle, middle - other[:2], atol=1e-5)
+    assert abs(transforms.wrap_angle(action.yaw - turned_action.yaw)) < 1e-5
+    sides = [plain({}, now, goal)[1].pick, plain({}, *half)[1].pick[::-1, ::-1]]
+    assert np.abs(sides[0] - sides[1]).max() > 0.1
+    np.testing.assert_allclose(heat.pick, (sides[0] + sides[1]) / 2, atol=1e-5)
+
+
+def test_max_height_sees_what_is_highest_only():
+    now, goal = random_map(2), random_map(3)
+    plain, blunt = (jax.jit(policy.GoalAwarePolicy(model=Looking(), max_height=high).act) for high in (False, True))
+    given = blunt({}, now, goal)
+    jax.tree.map(np.testing.assert_array_equal, given, plain({}, topdown.keep_highest(now), topdown.keep_highest(goal)))
+    assert np.abs(given[1].pick - plain({}, now, goal)[1].pick).max() > 0.1
+
+
+def test_switches_take_their_losses_along():
+    """No program is compiled: the names of the metrics are enough."""
+    named = {"loss", "loss_pick", "loss_place", "pick_right", "place_right", "place_near"}
+    matching, refining = {"loss_match", "loss_next", "match_right"}, {"loss_refine", "loss_fit", "refine_error", "fit_right"}
+    blunt = GOAL_AWARE.clone(matching=False)
+    for agent, names in (
+        (policy.GoalAwarePolicy(model=GOAL_AWARE), named | matching | refining),
+        (policy.GoalAwarePolicy(model=GOAL_AWARE, match_weight=0.0), named | refining),
+        (policy.GoalAwarePolicy(model=blunt), named | refining),
+        (policy.GoalAwarePolicy(model=GOAL_AWARE, refine=False), named | matching),
+    ):
+        blank = policy.empty_map(SPEC)
+        params = jax.eval_shape(agent.init, jax.random.key(0))
+        loss, metrics = jax.eval_shape(agent.loss, params, jax.random.key(0), state_of(0), blank, blank)
+        assert set(metrics) == names and loss.shape == ()
+
+
 def batched_loss(agent):
     """The mean loss of a batch, as training takes it."""
 
@@ -203,9 +408,12 @@ def test_transporters_lose_finitely_and_act_on_the_map(name):
 
 
 def test_goal_aware_learns_a_batch_by_heart():
-    """Law 7: pick, place and match of one batch are learnt; the gradient reaches every parameter; then the actions are right."""
+    """Law 7: pick, place, match and fit of one batch are learnt; the gradient reaches every parameter; then the actions are right.
+
+    The second example's object is oblong: its quarter turn, which covers the same place as well, is wrong.
+    """
     agent = POLICIES["goal_aware"]
-    examples = [example(0), example(4, done=1)]
+    examples = [example(0), example(4, done=1, sides=(0.07, 0.04))]
     keys, *batch = batch_of(*examples)
     optimizer = optax.adam(3e-3)
     params, act = compiled("goal_aware")
@@ -228,8 +436,8 @@ def test_goal_aware_learns_a_batch_by_heart():
             break
     metrics = {name: float(value) for name, value in metrics.items()}
     assert metrics["loss_pick"] < 0.3 and metrics["loss_place"] < 0.3, metrics
-    assert all(metrics[name] < 0.7 * first[name] for name in ("loss_match", "loss_next", "loss_refine")), metrics
-    assert metrics["pick_right"] == metrics["place_right"] == 1
+    assert all(metrics[name] < 0.7 * first[name] for name in ("loss_match", "loss_next", "loss_refine", "loss_fit")), metrics
+    assert metrics["pick_right"] == metrics["place_right"] == metrics["fit_right"] == 1
     for state, current, goal in examples:
         action, _ = act(params, current, goal)
         ready = int(np.argmax(state.ready))
@@ -238,3 +446,5 @@ def test_goal_aware_learns_a_batch_by_heart():
         cos, sin = np.cos(action.yaw), np.sin(action.yaw)
         landed = np.asarray(action.place[:2]) + np.array([[cos, -sin], [sin, cos]]) @ held
         assert np.linalg.norm(landed - np.asarray(state.goal[ready, :2])) < 0.012
+        off = transforms.yaw_from_quat(state.poses[ready, 3:]) + action.yaw - transforms.yaw_from_quat(state.goal[ready, 3:])
+        assert abs(float(transforms.wrap_angle(off, state.symmetry[ready]))) < 2 * math.pi / ROTATIONS

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from lala_jax import build, dataset, defaults, options, recording, rollout, types
-from lala_jax.sim import oracle, tasks
+from lala_jax.sim import oracle, physics, tasks
 
 
 def run(task, seeds, agent=None, **options):
@@ -127,7 +127,6 @@ def test_giving_up_ends_the_episode():
 
 def test_causes_are_told_apart():
     scene = tasks.get("tower", num_objects=2).sample(0)
-    from lala_jax.sim import physics
 
     def cause(index=0, held=True, ready=(True, False), before=(False, False), after=(False, False), shift=0.0):
         poses = np.array(scene.goal, float)
@@ -153,3 +152,72 @@ def test_interval_is_the_normal_one():
     summed = rollout.summary(episodes)
     half = 1.96 * np.std([100, 0, 0], ddof=1) / np.sqrt(3)
     np.testing.assert_allclose(summed["interval95"], [0.0, min(100, 100 / 3 + half)])
+
+
+def told(scene, *actions):
+    """An episode by hand: each action is `(cause, picked object, poses after, placed after)`, None for what stays as it was."""
+    count = len(scene.size)
+    episode = rollout.Episode(0, scene, [np.array(scene.start, float)], [np.zeros(count, bool)], [np.zeros(count, bool)], [], [], [])
+    for cause, index, poses, placed in actions:
+        episode.causes.append(cause)
+        episode.actions.append(types.PickPlace(pick=np.zeros(3), place=np.zeros(3), yaw=np.zeros(())))
+        episode.outcomes.append(physics.Outcome(object=index, held_to_place=index >= 0, reason="ok", seconds=1.0))
+        episode.poses.append(episode.poses[-1] if poses is None else poses)
+        episode.placed.append(episode.placed[-1] if placed is None else np.array(placed))
+        episode.ready.append(np.zeros(count, bool))
+    return episode
+
+
+def moved(poses, index, distance):
+    poses = np.array(poses, float)
+    poses[index, 0] += distance
+    return poses
+
+
+def test_what_first_went_wrong_and_what_became_of_each_object():
+    scene = tasks.get("tower", num_objects=3).sample(0)
+    start = np.array(scene.start, float)
+    first = moved(start, 0, 0.2)
+    episodes = [
+        # right, then knocked over by the second action; the third object is only pushed a little
+        told(
+            scene,
+            ("right", 0, first, [True, False, False]),
+            ("knocked over", 1, moved(moved(first, 0, 0.001), 2, 0.005), [False, False, False]),
+            ("missed pick", -1, None, None),
+        ),
+        # the third object is shoved aside by an action that is otherwise right; the second is tried twice
+        told(
+            scene,
+            ("right", 0, moved(first, 2, 0.02), [True, False, False]),
+            ("lost on the way", 1, None, None),
+            ("wrong yaw", 1, None, None),
+        ),
+        told(scene, ("right", 0, first, [True, False, False])),  # gave up
+        told(scene, ("wrong place", 0, None, None), ("right", 0, first, [True, True, True])),  # complete in the end
+    ]
+    assert rollout.lost_objects(episodes[0]) == ["knocked over", "knocked over", "never moved"]
+    assert rollout.lost_objects(episodes[1]) == ["wrong yaw", "right"]
+    assert rollout.lost_objects(episodes[2]) == ["never moved"] * 2 and rollout.lost_objects(episodes[3]) == []
+    summed = rollout.summary(episodes)
+    assert {cause: n for cause, n in summed["first_failures"].items() if n} == {"knocked over": 1, "lost on the way": 1, "none": 1}
+    assert {cause: n for cause, n in summed["lost_objects"].items() if n} == {
+        "knocked over": 2,
+        "wrong yaw": 1,
+        "right": 1,
+        "never moved": 3,
+    }
+    assert sum(summed["lost_objects"].values()) == sum(int((~e.placed[-1]).sum()) for e in episodes)
+
+
+def test_a_distractor_is_never_lost():
+    scene = tasks.get("tower", num_objects=1, distractors=1).sample(0)
+    episode = told(scene, ("wrong object", 1, moved(scene.start, 1, 0.1), [False, True]))
+    assert rollout.lost_objects(episode) == ["never moved"]
+    assert rollout.summary([episode])["first_failures"]["wrong object"] == 1
+
+
+def test_no_action_means_nothing_went_wrong_first():
+    episode = run(tasks.get("tower", num_objects=2), [0], constant(None))[0]
+    summed = rollout.summary([episode])
+    assert summed["first_failures"]["none"] == 1 and summed["lost_objects"]["never moved"] == 2

@@ -1,5 +1,6 @@
 """The training step: a pure function of state, data and key, compiled once, resumed bit for bit, loud about what is not finite."""
 
+import dataclasses
 import functools
 
 import jax
@@ -8,7 +9,7 @@ import numpy as np
 import optax
 import pytest
 
-from lala_jax import build, checkpoint, options, state, train, types
+from lala_jax import augment, build, checkpoint, options, state, train, train_step, types
 from lala_jax.sim import oracle, tasks
 
 OVERRIDES = (
@@ -85,10 +86,27 @@ def test_randomness_is_the_key_and_the_step():
     assert bits(advance(late, 1)[1]) != bits(same)
 
 
+def test_a_scene_and_its_goal_are_seen_with_the_same_errors():
+    """An example that is at its goal gives the same map twice, whatever the cameras' errors, another one's cameras err otherwise."""
+    errors = augment.Sensors(shift=0.02, turn=2.0, missing=1.0)
+    erring = dataclasses.replace(recipe(), sensors=errors)
+    twice = jax.tree.map(lambda leaf: jnp.stack([leaf[0], leaf[0]]), states())
+    examples = twice.replace(poses=twice.goal)
+    see = jax.jit(lambda key: train_step.observations(erring, key, examples))
+    now, goal = jax.device_get(see(jax.random.key(0)))
+    jax.tree.map(np.testing.assert_array_equal, now, goal)
+    assert np.abs(now.height[0] - now.height[1]).max() > 1e-3
+    again, other = (see(jax.random.key(seed))[0] for seed in (0, 1))
+    np.testing.assert_array_equal(again.height, now.height)
+    assert np.abs(other.height - now.height).max() > 1e-3
+
+
 def test_metrics_are_named_and_finite():
     metrics = advance(start(), 1)[1]
-    terms = {"loss_pick", "loss_place", "loss_match", "loss_next", "loss_refine"}
-    assert set(metrics) == terms | {"loss", "grad_norm", "pick_right", "place_right", "place_near", "match_right", "refine_error"}
+    terms = {"loss_pick", "loss_place", "loss_match", "loss_next", "loss_refine", "loss_fit"}
+    shares = {"pick_right", "place_right", "place_near", "match_right", "fit_right"}
+    assert set(metrics) == terms | shares | {"loss", "grad_norm", "refine_error"}
+    assert np.isnan(metrics["fit_right"]) and metrics["loss_fit"] == 0, "a cube's quarter turn fits as well"
     train.check_finite(1, metrics)
     np.testing.assert_allclose(sum(metrics[name] for name in terms), metrics["loss"], rtol=1e-5)
     assert metrics["grad_norm"] > 0

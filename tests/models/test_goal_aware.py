@@ -1,5 +1,7 @@
 """The goal-aware network: its parts against numpy loops and hand-made maps, and the symmetries that hold by construction."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,7 +30,8 @@ def build(columns, spec=SPEC):
         for level, colour in enumerate(colours, start=1):
             features[(*here, level)], count[(*here, level)] = colour, 5
             height[here] = (level + 1) * spec.slice_height
-    return types.TopDownMap(features=jnp.asarray(features), count=jnp.asarray(count), height=jnp.asarray(height))
+    middle = {"offset": jnp.zeros((*count.shape, 2)), "skin": jnp.zeros((*height.shape, 2))}
+    return types.TopDownMap(features=jnp.asarray(features), count=jnp.asarray(count), height=jnp.asarray(height), **middle)
 
 
 def random_map(seed, spec=SPEC):
@@ -38,7 +41,17 @@ def random_map(seed, spec=SPEC):
     count = np.maximum(rng.integers(-6, 5, grid), 0).astype(np.float32)
     features = (rng.random((*grid, 3)) * (count > 0)[..., None]).astype(np.float32)
     height = (spec.slices - np.argmax(count[..., ::-1] > 0, -1)) * spec.slice_height * (count > 0).any(-1)
-    return types.TopDownMap(features=jnp.asarray(features), count=jnp.asarray(count), height=jnp.asarray(height, jnp.float32))
+    offset = rng.uniform(-0.5, 0.5, (*grid, 2)) * (count > 0)[..., None]
+    skin = rng.uniform(-0.5, 0.5, (*grid[:2], 2)) * (count > 0).any(-1)[..., None]
+    return types.TopDownMap(*(jnp.asarray(leaf, jnp.float32) for leaf in (features, count, offset, height, skin)))
+
+
+def random_target(seed, spec=SPEC):
+    """Some of the goal's tokens, at random, are what was picked."""
+    rng = np.random.default_rng(seed)
+    weight = rng.random((spec.rows // 2, spec.cols // 2, spec.slices)) * (rng.random((spec.rows // 2, spec.cols // 2, spec.slices)) < 0.3)
+    level = rng.random(spec.slices)
+    return goal_aware.Target(weight=jnp.asarray(weight, jnp.float32), level=jnp.asarray(level / level.sum(), jnp.float32))
 
 
 @pytest.fixture(scope="module")
@@ -46,18 +59,36 @@ def variables():
     return jax.jit(NET.init)(jax.random.key(0, impl="rbg"), random_map(0), random_map(1), PICK)
 
 
-run = jax.jit(lambda variables, *inputs: NET.apply(variables, *inputs))
-look = jax.jit(lambda variables, *inputs: NET.apply(variables, *inputs, method="match"))
+@pytest.fixture(scope="module")
+def lively(variables):
+    """Parameters whose refinement says something: `init` starts it at nearly nothing."""
+    rng = np.random.default_rng(5)
+    params = dict(variables["params"])
+    net = dict(params["refine_net"])
+    for name in ("Dense_1", "Dense_2"):  # the offset, the fit
+        net[name] = {leaf: jnp.asarray(rng.normal(0, 0.3, value.shape), jnp.float32) for leaf, value in net[name].items()}
+    return {"params": params | {"refine_net": net}}
+
+
+def method(name, net=NET):
+    return jax.jit(lambda variables, *inputs: net.apply(variables, *inputs, method=name))
+
+
+run, look, refine = method("__call__"), method("match"), method("refine")
+layout, target, picture = method("layout"), method("target"), method("_picture")
 
 
 def test_shapes(variables):
-    match, place, offset = run(variables, random_map(0), random_map(1), PICK)
+    match, place, (offset, fit) = run(variables, random_map(0), random_map(1), PICK)
     assert match.pick.shape == (40, 20) and match.current.shape == (20, 10, 6)
     assert match.token.shape == (24, 3) and match.token_embedding.shape == (24, 6)
     assert match.token_valid.shape == match.token_next.shape == (24,)
-    assert place.logits.shape == (8, 40, 20) and place.key_input.shape[:2] == (40, 20)
-    assert place.crops.shape[:3] == (8, 8, 8) and offset.shape == (3,)
-    assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves((match.pick, place, offset)))
+    assert place.logits.shape == (8, 40, 20) and offset.shape == (3,) and fit.shape == ()
+    scene = layout(variables, random_map(0), random_map(1))
+    assert scene.now.shape == scene.goal.shape == (40, 20, 8) and scene.levels.shape == (40, 20, 7, 7)
+    found = target(variables, match, PICK)
+    assert found.weight.shape == (20, 10, 7) and found.level.shape == (7,)
+    assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves((match.pick, place, offset, fit, scene, found)))
 
 
 def test_vmap_equals_a_loop(variables):
@@ -69,20 +100,25 @@ def test_vmap_equals_a_loop(variables):
         jax.tree.map(lambda all_, one, index=index: np.testing.assert_allclose(all_[index], one, atol=1e-4), batch, one)
 
 
-def test_jit_equals_eager(variables):
-    """The refinement and the target mask, which hold every kind of step but the convolutional trunk."""
-    match, place, _ = run(variables, random_map(0), random_map(1), PICK)
-    for method, inputs in (("refine", (place, jnp.int32(2), PICK)), ("target_mask", (random_map(1), match, PICK))):
-        eager = NET.apply(variables, *inputs, method=method)
-        np.testing.assert_allclose(jax.jit(lambda *x, how=method: NET.apply(variables, *x, method=how))(*inputs), eager, atol=1e-5)
+def test_jit_equals_eager(lively):
+    """The refinement and the target, which hold every kind of step but the convolutional trunk."""
+    match = look(lively, random_map(0), random_map(1))
+    scene, found = layout(lively, random_map(0), random_map(1)), target(lively, match, PICK)
+    for name, inputs in (
+        ("refine", (scene, found, PICK, jnp.array([30, 4]), jnp.float32(2.3))),
+        ("target", (match, PICK)),
+    ):
+        eager = NET.apply(lively, *inputs, method=name)
+        jax.tree.map(functools.partial(np.testing.assert_allclose, atol=1e-5), method(name)(lively, *inputs), eager)
 
 
 def test_starts_near_zero(variables):
-    """Pick and place begin near indifference and the refinement at no offset, or the first steps go to undoing the start."""
-    match, place, offset = run(variables, build({(3, 4): [RED], (12, 2): [BLUE]}), build({(8, 6): [RED, BLUE]}), PICK)
+    """Pick and place begin near indifference and the refinement at no offset and any fit, or the first steps go to undoing the start."""
+    now, goal = build({(3, 4): [RED], (12, 2): [BLUE]}), build({(8, 6): [RED, BLUE]})
+    match, place, (offset, fit) = run(variables, now, goal, PICK)
     for logits in (match.pick, place.logits):
         assert np.std(logits) < 2 and np.ptp(logits) < 10
-    assert np.abs(offset).max() < 0.2
+    assert np.abs(offset).max() < 0.2 and fit == 0
 
 
 def test_pick_logits_equal_a_loop_over_tokens(variables):
@@ -138,15 +174,6 @@ def test_voxel_input_equals_a_loop():
         np.testing.assert_allclose(given[i, j, k], expected, atol=1e-5)
 
 
-def test_highest_takes_the_top_occupied_slice():
-    rng = np.random.default_rng(0)
-    values, seen = rng.normal(size=(5, 4, 3, 2)).astype(np.float32), rng.random((5, 4, 3)) < 0.5
-    given = goal_aware._highest(jnp.asarray(values), jnp.asarray(seen))
-    for i, j in np.ndindex(5, 4):
-        if seen[i, j].any():
-            np.testing.assert_array_equal(given[i, j], values[i, j, np.flatnonzero(seen[i, j])[-1]])
-
-
 def test_tokens_are_the_goal_voxels_that_differ(variables):
     """What the goal has elsewhere, in another colour, or that is not there yet; never what is the same or only there now."""
     now = build({(3, 4): [RED], (12, 2): [BLUE], (15, 5): [RED, BLUE]})
@@ -163,30 +190,123 @@ def test_more_differences_than_tokens_keep_the_largest(variables):
 
 
 @pytest.mark.parametrize(("picked", "other"), [((3, 4), (12, 2)), ((12, 2), (3, 4))])
-def test_target_mask_marks_the_matching_colour(variables, picked, other):
-    """Alone on the table now and in the goal, a block looks the same in both: its mask is 1 there, less on the other, 0 elsewhere."""
+def test_target_marks_the_matching_colour(variables, picked, other):
+    """Alone on the table now and in the goal, a block looks the same in both: its weight is 1 there, less on the other, 0 elsewhere."""
     now = {(3, 4): [RED], (12, 2): [BLUE]}
     home = {(3, 4): (8, 6), (12, 2): (16, 7)}
     goal = build({home[(3, 4)]: [RED], home[(12, 2)]: [BLUE]})
     match = look(variables, build(now), goal)
-    mask, height = np.moveaxis(np.asarray(NET.apply(variables, goal, match, 2 * jnp.array(picked), method="target_mask")), -1, 0)
-    seen = np.zeros(mask.shape, bool)
-    for row, col in home.values():
-        seen[2 * row : 2 * row + 2, 2 * col : 2 * col + 2] = True
-    assert ((mask > 0) <= seen).all() and ((height > 0) <= seen).all()
-    right, wrong = 2 * np.array(home[picked]), 2 * np.array(home[other])
+    found = target(variables, match, 2 * jnp.array(picked))
+    weight, level = np.asarray(found.weight), np.asarray(found.level)
+    assert set(map(tuple, np.argwhere(weight > 0).tolist())) <= {(*place, 1) for place in home.values()}
+    np.testing.assert_allclose(weight[(*home[picked], 1)], 1, atol=1e-5)
+    assert weight[(*home[other], 1)] < 0.9
+    np.testing.assert_allclose(level, np.arange(7) == 1, atol=1e-6)
+    mask, height = shown(variables, goal, found)
+    right = 2 * np.array(home[picked])
     np.testing.assert_allclose(mask[tuple(right)], 1, atol=1e-5)
-    assert mask[tuple(wrong)] < 0.9
     np.testing.assert_allclose(height[tuple(right)], 1.5 * SPEC.slice_height * goal_aware.HEIGHT_SCALE, rtol=1e-5)
+    assert (mask > 0).sum() <= 8 and ((height > 0) == (mask > 0)).all()
 
 
-def test_target_mask_leaves_out_columns_where_the_goal_saw_nothing(variables):
+def shown(variables, goal, found):
+    """How much of the picked object the place step sees in each column `[rows, cols]`, and how high."""
+    scene = layout(variables, goal, goal)
+    weight = jnp.repeat(jnp.repeat(found.weight, 2, 0), 2, 1)
+    return np.moveaxis(np.asarray(picture(variables, scene.goal, scene.levels, weight, found)), -1, 0)[8:10]
+
+
+def test_without_matching_nothing_says_what_looks_alike(variables):
+    """The coarse part of the pick is gone, with the fine part silenced all of it; nothing in the goal is the target."""
+    params = dict(variables["params"])
+    params["pick_out"] = jax.tree.map(jnp.zeros_like, params["pick_out"])
+    blunt = NET.clone(matching=False)
+    match = method("match", blunt)({"params": params}, random_map(0), random_map(1))
+    assert not match.pick.any() and look({"params": params}, random_map(0), random_map(1)).pick.any()
+    found = method("target", blunt)({"params": params}, match, PICK)
+    assert not found.weight.any() and not found.level.any()
+
+
+def test_target_is_seen_only_where_the_goal_saw_something(variables):
     """A token is two cells wide; the cell of it that no point fell into stays out."""
     now, goal = build({(3, 4): [RED]}), build({(8, 6): [RED]})
     goal = goal.replace(count=goal.count.at[16, 12].set(0))
-    match = look(variables, now, goal)
-    mask = np.asarray(NET.apply(variables, goal, match, jnp.array([6, 8]), method="target_mask"))
-    assert (mask[16, 12] == 0).all() and (mask[17, 13] > 0).all()
+    found = target(variables, look(variables, now, goal), jnp.array([6, 8]))
+    mask, height = shown(variables, goal, found)
+    assert mask[16, 12] == height[16, 12] == 0 and mask[17, 13] > 0 and height[17, 13] > 0
+
+
+def test_target_shares_its_levels(variables):
+    """The levels' shares are those of the best voxel in each, and sum to one; where nothing matches they are zero."""
+    match = look(variables, random_map(0), random_map(1))
+    found = target(variables, match, PICK)
+    score = np.asarray(match.token_embedding) @ np.asarray(match.current)[PICK[0] // 2, PICK[1] // 2]
+    best = np.zeros(7)
+    for at, value in zip(np.asarray(match.token), np.exp(score - score.max()), strict=True):
+        best[at[2]] = max(best[at[2]], value)
+        np.testing.assert_allclose(found.weight[tuple(at)], value, atol=1e-5)
+    np.testing.assert_allclose(found.level, best / best.sum(), atol=1e-5)
+    nothing = target(variables, look(variables, random_map(1), random_map(1)), PICK)
+    assert not nothing.weight.any() and not nothing.level.any()
+
+
+def top_of(maps, row, col):
+    """What is seen from above in one cell: centred colour, skin, scaled height, share covered; slow and obvious."""
+    maps = jax.tree.map(np.asarray, maps)
+    layers = np.flatnonzero(maps.count[row, col])
+    color = maps.features[row, col, layers[-1]] if len(layers) else np.zeros(3)
+    down, right = maps.skin[row, col]
+    return [*(color - 0.5), down, right, maps.height[row, col] * goal_aware.HEIGHT_SCALE, (1 - 2 * abs(down)) * (1 - 2 * abs(right))]
+
+
+def test_layout_and_picture_equal_a_loop(variables):
+    now, goal, found = random_map(0), random_map(1), random_target(2)
+    scene = layout(variables, now, goal)
+    weight = np.repeat(np.repeat(np.asarray(found.weight), 2, 0), 2, 1)
+    seen = picture(variables, scene.goal, scene.levels, jnp.asarray(weight), found)
+    assert seen.shape == (40, 20, 17)
+    count, features, offset = (np.asarray(leaf, float) for leaf in (goal.count, goal.features, goal.offset))
+    for row in range(1, SPEC.rows, 3):
+        for col in range(SPEC.cols):
+            surface = [*top_of(goal, row, col), float(now.height[row, col]) * goal_aware.HEIGHT_SCALE]
+            np.testing.assert_allclose(scene.now[row, col], [*top_of(now, row, col), 1], atol=1e-5)
+            np.testing.assert_allclose(scene.goal[row, col], surface, atol=1e-5)
+            layers = np.flatnonzero(count[row, col])
+            here, heights, total, share = [0.0], [0.0], np.zeros(6), 0.0
+            for layer in layers:
+                here.append(weight[row, col, layer])
+                heights.append(weight[row, col, layer] * (layer + 0.5) * SPEC.slice_height * goal_aware.HEIGHT_SCALE)
+                points = count[row, col, layer] * float(found.level[layer])
+                total += points * np.array([*(features[row, col, layer] - 0.5), *offset[row, col, layer], 1])
+                share += float(found.level[layer])
+            mean = total[:5] / max(total[5], 1e-6)
+            face = (weight[row, col, layers[-1]] if len(layers) else 0) * surface[6]
+            np.testing.assert_allclose(seen[row, col], [*surface, max(here), max(heights), *mean, share, face], atol=1e-4)
+
+
+def test_window_equals_a_padded_slice():
+    rng = np.random.default_rng(0)
+    for shape in ((9, 7), (9, 7, 3), (9, 7, 2, 4)):
+        values = rng.normal(size=shape).astype(np.float32)
+        padded = np.pad(values, [(40, 40), (40, 40)] + [(0, 0)] * (len(shape) - 2))
+        for row, col in ((2, 1), (-3, 4), (6, -2), (-6, 5), (30, 3), (-15, -15)):
+            given = goal_aware._window(jnp.asarray(values), row + jnp.arange(5), col + jnp.arange(4))
+            np.testing.assert_array_equal(given, padded[40 + row : 45 + row, 40 + col : 44 + col])
+        every_other = goal_aware._window(jnp.asarray(values), jnp.arange(-2, 6) // 2, jnp.arange(4))
+        np.testing.assert_array_equal(every_other, np.repeat(padded[39:43, 40:44], 2, 0))
+
+
+def test_turned_offsets_turn_as_vectors_do():
+    """Rows run along +y and columns along +x; what is no offset stays."""
+    rng = np.random.default_rng(0)
+    crops, yaws = rng.normal(size=(6, 5, 5, 8)).astype(np.float32), np.linspace(-4, 4, 6).astype(np.float32)
+    given = np.asarray(goal_aware._turn_offsets(jnp.asarray(crops), jnp.asarray(yaws)[:, None, None]))
+    for crop, after, yaw in zip(crops, given, yaws, strict=True):
+        turned = transforms.apply_se2(np.array([0, 0, yaw], float), crop[..., [4, 3]].astype(float))
+        np.testing.assert_allclose(after[..., [4, 3]], turned, atol=1e-5)
+        np.testing.assert_array_equal(np.delete(after, [3, 4], -1), np.delete(crop, [3, 4], -1))
+    one = goal_aware._turn_offsets(jnp.asarray(crops[2]), jnp.asarray(yaws[2]))
+    np.testing.assert_allclose(one, given[2], atol=1e-6)
 
 
 @pytest.mark.parametrize("quarters", [1, 2, 3])
@@ -195,23 +315,65 @@ def test_turning_what_is_picked_rolls_the_place_logits(variables, quarters):
 
     The key reads the current map's height; with that one input silenced it depends on the goal alone.
     """
-    net = goal_aware.GoalAware(spec=SQUARE, **SIZES)
     params = jax.tree.map(jnp.array, variables["params"])
     kernel = params["key_net"]["Conv_0"]["kernel"]
-    params["key_net"]["Conv_0"]["kernel"] = kernel.at[:, :, 4].set(0)
-    goal = random_map(1, SQUARE)
-    match = jax.tree.map(lambda leaf: leaf[:10] if leaf.shape[0] == 20 else leaf, look(variables, random_map(0), random_map(1)))
-    match = match.replace(token=match.token.at[:, 0].set(match.token[:, 0] % 10))
-    pick = np.array([9, 9])
+    params["key_net"]["Conv_0"]["kernel"] = kernel.at[:, :, 7].set(0)
+    before, after = (placed({"params": params}, turned(random_map(4, SQUARE), times)) for times in (0, quarters))
+    np.testing.assert_allclose(after, np.roll(before, -2 * quarters, axis=0), atol=1e-4)
+    assert np.ptp(before) > 1e-3
+    still = turned(random_map(4, SQUARE), quarters, vectors=False)
+    assert np.abs(placed({"params": params}, still) - np.roll(before, -2 * quarters, axis=0)).max() > 1e-3, "the skin says something"
+
+
+@pytest.mark.parametrize("quarters", [1, 2, 3])
+def test_refining_what_was_turned_equals_turning_more(lively, quarters):
+    """What is turned by a quarter before it is picked and held at a bin looks as what is held a quarter further."""
+    pick, cell, found, goal = jnp.array([9, 9]), jnp.array([12, 7]), random_target(3, SQUARE), random_map(1, SQUARE)
+    ask = functools.cache(lambda: method("refine", SQUARE_NET))()
+
+    def scene(times):
+        return SQUARE_NET.apply(lively, turned(random_map(4, SQUARE), times), goal, method="layout").replace(goal=hidden)
+
+    hidden = SQUARE_NET.apply(lively, goal, goal, method="layout").goal  # the height now, which the turn changes, is in it
+    for turn in (0.0, 1.3):
+        direct = ask(lively, scene(0), found, pick, cell, jnp.float32(turn + 2 * quarters))
+        given = ask(lively, scene(quarters), found, pick, cell, jnp.float32(turn))
+        jax.tree.map(functools.partial(np.testing.assert_allclose, atol=2e-4, rtol=1e-4), given, direct)
+        other = ask(lively, scene(0), found, pick, cell, jnp.float32(turn))
+        assert np.abs(other[0] - direct[0]).max() > 1e-2 and abs(other[1] - direct[1]) > 1e-2
+
+
+SQUARE_NET = goal_aware.GoalAware(spec=SQUARE, **SIZES)
+
+
+@functools.cache
+def _place_square():
+    def place(variables, current, goal, found):
+        scene = SQUARE_NET.apply(variables, current, goal, method="layout")
+        return SQUARE_NET.apply(variables, scene, found, jnp.array([9, 9]), method="place").logits
+
+    return jax.jit(place)
+
+
+def placed(variables, current):
+    """The place logits of what is picked in the middle of the square map."""
+    return np.asarray(_place_square()(variables, current, random_map(1, SQUARE), random_target(2, SQUARE)))
+
+
+def turned(whole, times, vectors=True):
+    """Turn what a pick in the middle sees by quarters, the places within the cells as well; nothing is left around it."""
     around = slice(2, 17)  # the pick is in the middle of it
-    whole = random_map(4, SQUARE)
-    place = jax.jit(lambda current: net.apply({"params": params}, current, goal, match, jnp.asarray(pick), method="place").logits)
 
-    def turned(times):
-        return jax.tree.map(lambda leaf: jnp.zeros_like(leaf).at[around, around].set(_quarter_turn(leaf[around, around], times)), whole)
+    def one(leaf):
+        return jnp.zeros_like(leaf).at[around, around].set(_quarter_turn(leaf[around, around], times))
 
-    np.testing.assert_allclose(place(turned(quarters)), np.roll(place(turned(0)), -2 * quarters, axis=0), atol=1e-4)
-    assert np.ptp(place(turned(0))) > 1e-3
+    out = jax.tree.map(one, whole)
+    return out.replace(skin=_turn_vectors(out.skin, times), offset=_turn_vectors(out.offset, times)) if vectors else out
+
+
+def _turn_vectors(vectors, times):
+    xy = transforms.apply_se2(np.array([0, 0, times * np.pi / 2]), np.asarray(vectors, float)[..., ::-1])
+    return jnp.asarray(np.asarray(xy)[..., ::-1], jnp.float32)
 
 
 def _quarter_turn(picture, times):
@@ -226,14 +388,43 @@ def _quarter_turn(picture, times):
     return jnp.asarray(out)
 
 
-def test_refine_reads_the_patch_under_the_cell(variables):
-    """The offset at a cell depends on the key input within half a crop and on the crop of its bin, on nothing else."""
-    _, place, _ = run(variables, random_map(0), random_map(1), PICK)
-    refine = jax.jit(lambda place: NET.apply(variables, place, jnp.int32(3), jnp.array([20, 10]), method="refine"))
-    before = refine(place)
-    far = jnp.ones((40, 20, 1), bool).at[16:24, 6:14].set(False)
-    crops = jnp.where(jnp.arange(8)[:, None, None, None] == 3, place.crops, 7.0)
-    other = place.replace(key_input=jnp.where(far, 7.0, place.key_input), crops=crops)
-    np.testing.assert_array_equal(refine(other), before)
-    assert not np.array_equal(refine(place.replace(key_input=place.key_input.at[16, 6].add(1.0))), before)
-    assert not np.array_equal(refine(place.replace(crops=place.crops.at[3].add(1.0))), before)
+def test_refine_reads_the_window_under_the_cell_and_around_the_pick(lively):
+    """Nothing that is farther than half a crop from the cell in the goal, or than a turned crop reaches from the pick, matters."""
+    scene, found = layout(lively, random_map(0), random_map(1)), random_target(2)
+    pick, cell = jnp.array([13, 6]), jnp.array([20, 10])
+
+    def ask(scene, found=found):
+        return refine(lively, scene, found, pick, cell, jnp.float32(3.4))
+
+    def apart(a, b):
+        return abs(a[0] - b[0]).max() > 1e-4 and abs(a[1] - b[1]) > 1e-4
+
+    before = ask(scene)
+    under = jnp.zeros((40, 20, 1), bool).at[16:24, 6:14].set(True)
+    near = jnp.zeros((40, 20, 1), bool).at[6:21, 0:14].set(True)  # 7 cells about the pick: a crop of 8, turned
+    elsewhere = scene.replace(
+        now=jnp.where(near, scene.now, 7.0), goal=jnp.where(under, scene.goal, 7.0), levels=jnp.where(under[..., None], scene.levels, 7.0)
+    )
+    weight = jnp.where(under[::2, ::2], found.weight, 7.0)
+    jax.tree.map(np.testing.assert_array_equal, ask(elsewhere, found.replace(weight=weight)), before)
+    assert apart(ask(scene.replace(goal=scene.goal.at[16, 6].add(1.0))), before)
+    assert apart(ask(scene.replace(levels=scene.levels.at[23, 13].add(1.0))), before)
+    assert apart(ask(scene.replace(now=scene.now.at[13, 6].add(1.0))), before)
+    assert apart(ask(scene, found.replace(weight=found.weight.at[8, 3].add(1.0))), before)
+    assert apart(ask(scene, found.replace(level=jnp.roll(found.level, 1))), before)
+
+
+def test_refine_goes_with_the_cell_and_the_pick(lively):
+    """Shifted together by whole tokens, goal and cell, or present and pick, give the same: the refinement knows no places."""
+    scene, found = layout(lively, random_map(0), random_map(1)), random_target(2)
+    pick, cell, shift = jnp.array([13, 9]), jnp.array([20, 9]), jnp.array([4, 2])
+
+    def moved(leaf, factor=1):
+        return jnp.roll(leaf, (int(shift[0]) // factor, int(shift[1]) // factor), (0, 1))
+
+    before = refine(lively, scene, found, pick, cell, jnp.float32(1.7))
+    there = scene.replace(goal=moved(scene.goal), levels=moved(scene.levels))
+    after = refine(lively, there, found.replace(weight=moved(found.weight, 2)), pick, cell + shift, jnp.float32(1.7))
+    jax.tree.map(functools.partial(np.testing.assert_allclose, atol=1e-5), after, before)
+    after = refine(lively, scene.replace(now=moved(scene.now)), found, pick + shift, cell, jnp.float32(1.7))
+    jax.tree.map(functools.partial(np.testing.assert_allclose, atol=1e-5), after, before)

@@ -63,6 +63,22 @@ def test_crop_b_shows_the_object_after_a_world_turn_by_b_bins(bins):
         assert np.abs(crops[b] - after).mean() < 0.01
 
 
+@pytest.mark.parametrize(("size", "center"), [(5, (7.5, 5.5)), (8, (3.2, 9.9)), (8, (0.5, 0.5))])
+def test_a_turned_crop_is_the_rotated_crop_of_its_angle(size, center):
+    """At the bins' angles, and any number of turns more; in between it is neither neighbour."""
+    crops = rotate_crop(jnp.asarray(PICTURE), center, 12, size)
+    turned_crop = jax.jit(image.turned_crop, static_argnums=3)
+    for b in (0, 1, 5, 9, 11):
+        for turns in (0, -1):
+            yaw = jnp.float32(2 * np.pi * (b / 12 + turns))
+            np.testing.assert_allclose(turned_crop(jnp.asarray(PICTURE), center, yaw, size), crops[b], atol=2e-5)
+    between = turned_crop(jnp.asarray(PICTURE), center, jnp.float32(2 * np.pi * 1.5 / 12), size)
+    np.testing.assert_allclose(between, rotate_crop(jnp.asarray(PICTURE), center, 24, size)[3], atol=2e-5)
+    assert all(np.abs(between - crops[b]).max() > 0.01 for b in (1, 2))
+    eager = image.turned_crop(jnp.asarray(PICTURE), center, jnp.float32(2 * np.pi / 12), size)
+    np.testing.assert_allclose(eager, crops[1], atol=2e-5)
+
+
 def test_crops_at_the_rim_are_zero_outside():
     crops = rotate_crop(jnp.ones((10, 10, 1)), (0.5, 0.5), 4, 8)
     np.testing.assert_array_equal(crops[0, :4], 0)

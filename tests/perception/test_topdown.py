@@ -1,5 +1,6 @@
 """The fused map against a slow loop over points, and the laws of cells: half a cell, any order."""
 
+import collections
 import functools
 
 import jax
@@ -15,20 +16,29 @@ from lala_jax.perception import camera, topdown
 SPEC = types.MapSpec(x=(0.25, 0.45), y=(-0.1, 0.2), z=(0.0, 0.08), cell=0.025, slices=4)
 
 
-def slow_fuse(points, features, valid, spec, floor_margin=0.01, surface_margin=0.001):
+def slow_fuse(points, features, valid, spec, floor_margin=0.01, surface_margin=0.001, skin=0.005):
     """Put one point after the other into dictionaries of cells."""
     grid = (spec.rows, spec.cols, spec.slices)
-    total, count, height = np.zeros((*grid, features.shape[1])), np.zeros(grid), np.zeros(grid[:2])
+    total, within, count, height = np.zeros((*grid, features.shape[1])), np.zeros((*grid, 2)), np.zeros(grid), np.zeros(grid[:2])
+    columns = collections.defaultdict(list)
     for (x, y, z), feature, ok in zip(points.astype(float), features.astype(float), valid, strict=True):
-        row, col = int(np.floor((y - spec.y[0]) / spec.cell)), int(np.floor((x - spec.x[0]) / spec.cell))
+        at = np.array([(y - spec.y[0]) / spec.cell, (x - spec.x[0]) / spec.cell])
+        row, col = np.floor(at).astype(int)
         inside = 0 <= row < spec.rows and 0 <= col < spec.cols and spec.z[0] - floor_margin <= z < spec.z[1]
         if not (ok and inside):
             continue
         layer = max(0, int(np.floor((z - surface_margin - spec.z[0]) / spec.slice_height)))
         total[row, col, layer] += feature
+        within[row, col, layer] += at - (row + 0.5, col + 0.5)
         count[row, col, layer] += 1
         height[row, col] = max(height[row, col], z - spec.z[0])
-    return total / np.maximum(count, 1)[..., None], count, height
+        columns[row, col].append((z - spec.z[0], at - (row + 0.5, col + 0.5)))
+    face = np.zeros((*grid[:2], 2))
+    for cell, those in columns.items():
+        high = [place for z, place in those if z > height[cell] - skin]
+        face[cell] = np.mean(high, 0) if high else 0
+    number = np.maximum(count, 1)[..., None]
+    return types.TopDownMap(features=total / number, count=count, offset=within / number, height=height, skin=face)
 
 
 def cloud(number=2000, channels=3, seed=0):
@@ -51,11 +61,60 @@ max_height = jax.jit(topdown.max_height)
 def test_fuse_equals_a_slow_loop(channels, margins):
     points, features, valid = cloud(channels=channels)
     fused = fuse(*map(jnp.asarray, (points, features, valid)), spec=SPEC, **margins)
-    mean, count, height = slow_fuse(points, features, valid, SPEC, **margins)
-    assert count.sum() > 300
-    np.testing.assert_array_equal(fused.count, count)
-    np.testing.assert_allclose(fused.features, mean, atol=1e-6)
-    np.testing.assert_allclose(fused.height, height, atol=1e-7)
+    slow = slow_fuse(points, features, valid, SPEC, **margins)
+    assert slow.count.sum() > 300
+    np.testing.assert_array_equal(fused.count, slow.count)
+    np.testing.assert_allclose(fused.features, slow.features, atol=1e-6)
+    np.testing.assert_allclose(fused.height, slow.height, atol=1e-7)
+    np.testing.assert_allclose(fused.offset, slow.offset, atol=2e-5)
+    np.testing.assert_allclose(fused.skin, slow.skin, atol=2e-5)
+    assert np.abs(slow.skin).max() > 0.3 and np.abs(fused.offset).max() < 0.5
+
+
+@pytest.mark.parametrize("skin", [0.0005, 0.02])
+def test_the_skins_depth_is_an_option(skin):
+    """From the highest point alone to all points of a column."""
+    points, features, valid = cloud(seed=3)
+    thin = jax.jit(functools.partial(topdown.fuse, spec=SPEC, skin=skin))(*map(jnp.asarray, (points, features, valid)))
+    slow = slow_fuse(points, features, valid, SPEC, skin=skin)
+    np.testing.assert_allclose(thin.skin, slow.skin, atol=2e-5)
+    default = fuse(*map(jnp.asarray, (points, features, valid)), spec=SPEC)
+    np.testing.assert_array_equal(thin.offset, default.offset)
+    assert np.abs(thin.skin - default.skin).max() > 0.05
+
+
+def box_points(low, high, height, step=0.0005):
+    """Points on the top and the sides (but for their last 6 mm) of a box between `low` and `high` (x, y) and on the floor around it."""
+    spots = [np.arange(a + step / 2, b, step) for a, b in (SPEC.x, SPEC.y)]
+    every = np.stack(np.meshgrid(*spots, indexing="ij"), -1).reshape(-1, 2)
+    inside = ((every > low) & (every < high)).all(-1)
+    points = [np.column_stack([every, height * inside])]
+    spots = [spot[(spot > a) & (spot < b)] for spot, a, b in zip(spots, low, high, strict=True)]
+    for z in np.arange(0, height - 0.006, 4 * step):
+        rim = [np.column_stack([np.full(len(spots[1]), x), spots[1]]) for x in (low[0] + 1e-5, high[0] - 1e-5)]
+        rim += [np.column_stack([spots[0], np.full(len(spots[0]), y)]) for y in (low[1] + 1e-5, high[1] - 1e-5)]
+        points.append(np.insert(np.concatenate(rim), 2, z, axis=1))
+    return np.concatenate(points).astype(np.float32)
+
+
+@pytest.mark.parametrize(("low", "high"), [((0.283, -0.041), (0.3605, 0.087)), ((0.3015, -0.0985), (0.4295, 0.1485))])
+def test_skin_tells_how_far_a_top_face_fills_its_cells(low, high):
+    """Along a row or column through a box, the shares `1 - 2 |skin|` of its cells add up to its side, though cells are 25 mm."""
+    points = box_points(low, high, 0.06)
+    fused = jax.device_get(fuse(jnp.asarray(points), jnp.zeros((len(points), 1)), jnp.ones(len(points), bool), spec=SPEC))
+    on_top = fused.height > 0.05
+    middle = np.floor(types.cell_from_world(SPEC, np.mean([low, high], 0))).astype(int)
+    for axis, side in ((1, 0), (0, 1)):  # columns run along x
+        lines = [np.take(leaf, middle[1 - axis], 1 - axis) for leaf in (fused.skin[..., axis], on_top)]
+        share = (1 - 2 * np.abs(lines[0])) * lines[1]
+        assert abs(share.sum() * SPEC.cell - (high[side] - low[side])) < 3e-4
+        assert (share < 0.999).sum() > 0 and ((share > 0.98) | ~lines[1]).sum() >= len(share) - 2, "all cells but the ends are full"
+        first, last = np.flatnonzero(lines[1])[[0, -1]]
+        corner = (SPEC.x, SPEC.y)[side][0]
+        assert abs(corner + (first + 1 - share[first]) * SPEC.cell - low[side]) < 2e-4
+        assert abs(corner + (last + share[last]) * SPEC.cell - high[side]) < 2e-4
+    covered = np.prod(1 - 2 * np.abs(fused.skin), -1)[on_top].sum() * SPEC.cell**2
+    assert abs(covered / np.prod(np.subtract(high, low)) - 1) < 0.01
 
 
 def test_jit_equals_eager_and_vmap_and_map_equal_a_loop():
@@ -76,7 +135,8 @@ def test_the_order_of_points_does_not_matter(seed):
     second = fuse(*map(jnp.asarray, (points[order], features[order], valid[order])), spec=SPEC)
     np.testing.assert_array_equal(first.count, second.count)
     np.testing.assert_array_equal(first.height, second.height)
-    np.testing.assert_allclose(first.features, second.features, atol=1e-6)
+    for name in ("features", "offset", "skin"):
+        np.testing.assert_allclose(getattr(first, name), getattr(second, name), atol=1e-6)
 
 
 def test_dropped_points_leave_no_trace_even_if_they_are_nan():
@@ -162,13 +222,13 @@ def test_from_views_equals_fuse_of_the_slow_points():
     views = table_views()
     fused = from_views(views, spec=SPEC)
     points = np.asarray(jax.jit(jax.vmap(camera.unproject))(views.depth, views.camera))
-    mean, count, height = slow_fuse(
-        points.reshape(-1, 3), np.asarray(views.rgb).reshape(-1, 3), np.asarray(views.depth > 0).reshape(-1), SPEC
-    )
-    assert np.abs(fused.count - count).sum() <= 4, "a point on a cell's border may round either way"
-    np.testing.assert_allclose(fused.height, height, atol=1e-5)
-    same = np.asarray(fused.count == count)
-    np.testing.assert_allclose(np.asarray(fused.features)[same], mean[same], atol=1e-5)
+    slow = slow_fuse(points.reshape(-1, 3), np.asarray(views.rgb).reshape(-1, 3), np.asarray(views.depth > 0).reshape(-1), SPEC)
+    assert np.abs(fused.count - slow.count).sum() <= 4, "a point on a cell's border may round either way"
+    np.testing.assert_allclose(fused.height, slow.height, atol=1e-5)
+    same = np.asarray(fused.count == slow.count)
+    np.testing.assert_allclose(np.asarray(fused.features)[same], slow.features[same], atol=1e-5)
+    np.testing.assert_allclose(np.asarray(fused.offset)[same], slow.offset[same], atol=1e-4)
+    np.testing.assert_allclose(np.asarray(fused.skin)[same.all(-1)], slow.skin[same.all(-1)], atol=1e-4)
 
 
 def test_the_order_of_views_does_not_matter():
@@ -206,13 +266,40 @@ def test_max_height_equals_a_loop():
     count = rng.integers(0, 2, (6, 5, 4)) * rng.integers(0, 2, (6, 5, 1))
     features = rng.random((6, 5, 4, 3)) * (count > 0)[..., None]
     height = rng.random((6, 5))
-    fields = (jnp.asarray(a, jnp.float32) for a in (features, count, height))
+    fields = (jnp.asarray(a, jnp.float32) for a in (features, count, np.zeros((6, 5, 4, 2)), height, np.zeros((6, 5, 2))))
     seen = max_height(types.TopDownMap(*fields))
+    alone = topdown.highest(jnp.asarray(features, jnp.float32), jnp.asarray(count > 0))
+    np.testing.assert_array_equal(alone, seen[..., :3])
     for i in range(6):
         for j in range(5):
             layers = np.flatnonzero(count[i, j])
             expected = features[i, j, layers[-1]] if len(layers) else np.zeros(3)
             np.testing.assert_allclose(seen[i, j], [*expected, height[i, j]], atol=1e-6)
+
+
+def test_keep_highest_equals_a_loop():
+    fused = fuse(*map(jnp.asarray, cloud(seed=2)), spec=SPEC)
+    kept = topdown.keep_highest(fused)
+    for row, col in np.ndindex(SPEC.rows, SPEC.cols):
+        layers = np.flatnonzero(np.asarray(fused.count[row, col]))
+        for name in ("features", "count", "offset"):
+            before, after = (np.asarray(getattr(one, name)[row, col]) for one in (fused, kept))
+            expected = np.zeros_like(before)
+            expected[layers[-1:]] = before[layers[-1:]]
+            np.testing.assert_array_equal(after, expected)
+    assert (kept.count > 0).sum() < (fused.count > 0).sum() - 50
+    np.testing.assert_array_equal(max_height(kept), max_height(fused))
+    np.testing.assert_array_equal(kept.skin, fused.skin)
+
+
+def test_half_turn_is_the_map_of_turned_points():
+    points, features, valid = cloud(seed=4)
+    turned = points * np.array([-1, -1, 1]) + np.array([sum(SPEC.x), sum(SPEC.y), 0])
+    there = fuse(jnp.asarray(turned, jnp.float32), jnp.asarray(features), jnp.asarray(valid), spec=SPEC)
+    here = topdown.half_turn(fuse(*map(jnp.asarray, (points, features, valid)), spec=SPEC))
+    np.testing.assert_array_equal(there.count, here.count)
+    jax.tree.map(functools.partial(np.testing.assert_allclose, atol=2e-5), there, here)
+    jax.tree.map(np.testing.assert_array_equal, topdown.half_turn(topdown.half_turn(here)), here)
 
 
 def test_fused_features_are_differentiable():

@@ -1,0 +1,105 @@
+"""The main results: `python -m experiments.main_table --task=tower --demos=500,50,10 --seeds=0,1,2`.
+
+Trains `configs/<task>.py` as it ships, the first number of demonstrations with every seed, the others with the first seed, and scores each
+run on the test split. Fewer demonstrations are the first ones recorded. Writes `main.json` (see `common`; `means` holds the mean over
+the seeds of each number of demonstrations) to `--out`, experiments/results/<task> unless told, and prints a table. Runs lie in
+`--workdir`, each in <workdir>-<demos>-<seed>. Started again, it goes on with the runs that are missing, and within a run where its
+training stopped.
+"""
+
+from __future__ import annotations
+
+import functools
+import pathlib
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from experiments import common
+from lala_jax import build, options, train
+
+FLAGS = {"task": "tower", "demos": "500,50,10", "seeds": "0,1,2", "split": "test", "start": 0, "episodes": 100, "out": ""}
+
+
+def main(config, workdir, *, task: str, demos: str, seeds: str, split: str, start: int, episodes: int, out: str) -> list[dict[str, Any]]:
+    """Train a task's config for each number of demonstrations and seed, and score on the test split."""
+    base = options.override(config, [f"eval.split={split}", f"eval.start={start}", f"eval.episodes={episodes}"])
+    scored = build.split_seeds(split, start, episodes)
+    jobs = []
+    for row in plan(common.numbers("--demos", demos), common.numbers("--seeds", seeds)):
+        directory = f"{build.workdir(config, workdir)}-{row.name}"
+        job = functools.partial(run, row.configs(base)[0], directory)
+        jobs.append(common.Job(row.name, row.label, common.identity(row, base, scored, weights=None), job))
+
+    def finish(done: Sequence[dict[str, Any]]) -> dict[str, Any]:
+        return {"task": task, "split": split, "means": means(done)}
+
+    path = pathlib.Path(out or f"experiments/results/{task}") / "main.json"
+    done = common.fill(path, jobs, finish)
+    print(f"\n{table(done)}\n\n{path}")
+    return done
+
+
+def plan(demos: Sequence[int], seeds: Sequence[int]) -> list[common.Row]:
+    """List the runs: the first number of demonstrations with every seed, the others with the first."""
+    pairs = [(count, seed) for count in demos for seed in (seeds if count == demos[0] else seeds[:1])]
+    return [common.Row(f"{n}-{seed}", f"{n} demonstrations, seed {seed}", (f"data.demos={n}", f"seed={seed}")) for n, seed in pairs]
+
+
+def run(config, directory: str) -> dict[str, Any]:
+    """Train one run and score it."""
+    summary = train.train_and_evaluate(config, directory)
+    seconds = common.train_seconds(pathlib.Path(directory))
+    return {**common.row_of(summary), "demos": config.data.demos, "train_seed": config.seed, "train_seconds": seconds}
+
+
+def means(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Give the mean over the seeds, the extremes and the standard deviation (null for one seed) for each number of demonstrations."""
+    found = []
+    for demos in dict.fromkeys(row["demos"] for row in rows):
+        own = [row for row in rows if row["demos"] == demos]
+        scores = [row["score"] for row in own]
+        found.append(
+            {
+                "demos": demos,
+                "train_seeds": [row["train_seed"] for row in own],
+                "score": float(np.mean(scores)),
+                "lowest": min(scores),
+                "highest": max(scores),
+                "deviation": float(np.std(scores, ddof=1)) if len(scores) > 1 else None,
+                "complete_percent": float(np.mean([row["complete_percent"] for row in own])),
+                "train_seconds": float(np.mean([row["train_seconds"] for row in own])),
+            }
+        )
+    return found
+
+
+def table(rows: Sequence[dict[str, Any]]) -> str:
+    """Write the runs, and the means where there are several seeds, as a Markdown table."""
+    lines = [
+        [
+            row["label"],
+            common.with_interval(row["score"], row["interval95"]),
+            f"{row['complete_percent']:.0f}%",
+            f"{row['train_seconds']:.0f}",
+        ]
+        for row in rows
+    ]
+    for mean in means(rows):
+        if mean["deviation"] is not None:
+            label = f"{mean['demos']} demonstrations, mean of {len(mean['train_seeds'])} seeds"
+            spread = f"{mean['score']:.1f} (deviation {mean['deviation']:.1f})"
+            lines.append([label, spread, f"{mean['complete_percent']:.0f}%", f"{mean['train_seconds']:.0f}"])
+    return common.table(["", "score", "complete", "training, s"], lines)
+
+
+def command(argv: Sequence[str] | None = None):
+    """Run from the command line."""
+    return options.run(
+        main, flags=FLAGS, config_from=common.shipped_config, workdir=build.WORKDIR, user_errors=common.USER_ERRORS, argv=argv
+    )
+
+
+if __name__ == "__main__":
+    command()

@@ -1,0 +1,111 @@
+"""One policy in changed worlds: `python -m experiments.robustness --checkpoint=runs/tower/checkpoints --split=test --episodes=100`.
+
+Each row of `ROWS` is scored with the same weights on the same seeds and compared with the first. Writes `robustness-<split>.json` to
+`--out`, experiments/results/<task> unless told, and prints a table. The file is as `common` says; each row's `drop` is the first row's
+score less its own, and `conditions` is what `lala_jax.publish --robustness` reads. Started again, it goes on with the rows that are
+missing; `--rows=moved,noise` runs only these.
+"""
+
+from __future__ import annotations
+
+import functools
+import pathlib
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from experiments import common
+from lala_jax import build, evaluate, options
+from lala_jax.sim import oracle
+from lala_jax.sim.tasks import base
+
+MOVED = ("camera.shift=0.03", "camera.turn=3.0")
+ROWS = (
+    common.Row("nominal", "as trained"),
+    common.Row("moved", "cameras moved up to 3 cm and 3 degrees, calibrated by themselves", (*MOVED, "camera.calibrate=true")),
+    common.Row("moved-uncalibrated", "the same, not calibrated", (*MOVED, "camera.calibrate=false")),
+    common.Row("noise", "depth noise like a RealSense D415's", ("camera.depth_noise=true",)),
+    common.Row("colors", "colours never seen", ("task.colors=uniform",)),
+    common.Row("missing", "one camera of four missing, each in a quarter", parts=tuple((f"camera.missing={k}",) for k in range(4))),
+    common.Row("distractors", "two objects that the goal does not show", ("task.distractors=2",)),
+    *(common.Row(f"tower-{n}", f"towers of {n}", (f"task.num_objects={n}",), tasks=("tower",)) for n in (3, 4, 6)),
+)
+PUBLISHED = ("episodes", "score", "interval95", "complete_percent")
+FLAGS = {"checkpoint": "", "split": "test", "start": 0, "episodes": 100, "rows": "", "out": ""}
+
+
+def main(config, workdir, *, checkpoint: str, split: str, start: int, episodes: int, rows: str, out: str) -> list[dict[str, Any]]:
+    """Score a checkpoint in the worlds of `ROWS`."""
+    del workdir
+    name, seeds = config.task.name, build.split_seeds(split, start, episodes)
+    params, weights = common.load_weights(checkpoint, config, build.build_policy(config))
+    chosen = common.choose(ROWS, rows, name)
+    paired = {row.name: same_scenes(config, row.configs(config)[0], seeds) for row in chosen}
+    jobs = [
+        common.Job(
+            row.name, row.label, common.identity(row, config, seeds, weights=weights), functools.partial(run, row, config, params, seeds)
+        )
+        for row in chosen
+    ]
+
+    def finish(done: Sequence[dict[str, Any]]) -> dict[str, Any]:
+        for row in done[1:]:
+            row["drop"] = common.difference(done[0]["scores"], row["scores"], paired=paired[row["name"]])
+        conditions = {row["label"]: {field: row[field] for field in PUBLISHED} for row in done}
+        return {"task": name, "split": split, "checkpoint": checkpoint, "reference": done[0]["name"], "conditions": conditions}
+
+    path = pathlib.Path(out or f"experiments/results/{name}") / f"robustness-{split}.json"
+    done = common.fill(path, jobs, finish)
+    print(f"\n{table(done)}\n\n{path}")
+    return done
+
+
+def run(row: common.Row, config, params, seeds: Sequence[int]) -> dict[str, Any]:
+    """Score one row: each part on its share of the seeds."""
+    parts = zip(row.configs(config), common.shares(seeds, len(row.parts)), strict=False)  # fewer seeds than parts: the first parts
+    return common.row_of(common.merged([common.score(one, params, share) for one, share in parts]))
+
+
+def same_scenes(config, other, seeds: Sequence[int]) -> bool:
+    """Say whether the wanted objects of two configs' scenes are the same for every seed; raises where a scene cannot be drawn."""
+    tasks = build.task(config), build.task(other)
+    if tasks[0] == tasks[1]:
+        return True
+    same = [_same(*(_wanted(task, seed) for task in tasks)) for seed in seeds]  # every scene is drawn, also after one that differs
+    return all(same)
+
+
+def _wanted(task: base.Task, seed: int):
+    scene = task.sample(seed)
+    kept = oracle.wanted(scene)
+    return scene.base, [leaf[kept] for leaf in (scene.size, scene.color, scene.start, scene.goal)]
+
+
+def _same(one, other) -> bool:
+    return all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True))
+
+
+def table(rows: Sequence[dict[str, Any]]) -> str:
+    """Write the rows as a Markdown table."""
+    lines = [
+        [
+            row["label"],
+            common.with_interval(row["score"], row["interval95"]),
+            f"{row['complete_percent']:.0f}%",
+            common.with_interval(row["drop"]["mean"], row["drop"]["interval95"], signed=True) if "drop" in row else "",
+            common.counted(row["first_failures"]),
+        ]
+        for row in rows
+    ]
+    return common.table(["world", "score", "complete", "drop", "first to go wrong, episodes"], lines)
+
+
+def command(argv: Sequence[str] | None = None):
+    """Run from the command line."""
+    return options.run(main, flags=FLAGS, config_from=evaluate.stored_config, workdir=".", user_errors=common.USER_ERRORS, argv=argv)
+
+
+if __name__ == "__main__":
+    command()

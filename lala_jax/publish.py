@@ -1,0 +1,283 @@
+"""Turn a checkpoint and its scores into weights that ship with the package.
+
+    python -m lala_jax.publish --checkpoint=runs/tower/checkpoints --scores=experiments/results/tower/scores-policy-test.json \\
+        --out=lala_jax/weights/tower
+
+Several score files are separated by commas; `lala_jax.evaluate --checkpoint=pretrained/tower` repeats the first. `--dtype=bfloat16` halves
+the size. `--robustness=experiments/results/tower/robustness-test.json` adds a table of scores in other worlds.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import pathlib
+import shlex
+import shutil
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from lala_jax import build, checkpoint, evaluate, options, pretrained, state, train, writers
+
+LARGEST = 12_000_000  # bytes of weights.npz
+LICENCE = "Apache-2.0"
+README = "README.md"
+SCORE = ("episodes", "score", "interval95", "complete_percent")
+
+
+def main(config, workdir, *, checkpoint: str, scores: str, out: str, dtype: str, robustness: str) -> None:
+    """Write weights.npz, card.json and README.md to the directory `--out`."""
+    del workdir
+    if options.to_dict(config) != options.to_dict(stored_config({"checkpoint": checkpoint, "scores": scores, "out": out})):
+        raise options.OptionsError("the config of published weights is that of their checkpoint: leave --config out")
+    card = publish(checkpoint, scores.split(","), out, dtype=dtype, robustness=robustness or None)
+    size = (pathlib.Path(out) / pretrained.ARRAYS).stat().st_size
+    print(f"{out}: {card['parameters']:,} parameters, {dtype}, {size / 1e6:.1f} MB; check with\n{card['commands']['evaluate']}")
+
+
+def stored_config(flags: Mapping[str, Any]):
+    """Give the checkpoint's config, once all flags that are needed are there."""
+    missing = [f"--{name}=PATH" for name in ("checkpoint", "scores", "out") if not flags[name]]
+    if missing:
+        raise options.OptionsError(f"give {' and '.join(missing)}")
+    return evaluate.stored_config(flags)
+
+
+def publish(
+    source: str, score_files: Sequence[str], out: str | os.PathLike[str], *, dtype: str = "float32", robustness: str | None = None
+) -> dict[str, Any]:
+    """Write the three files of a checkpoint to `out`, all or none, and give the card.
+
+    Raises OptionsError on scores of another checkpoint, model or world and where `out` holds something else, CheckpointError on
+    a checkpoint that cannot be read or published.
+    """
+    options.check_choice("--dtype", dtype, pretrained.STORED)
+    out = pathlib.Path(out)
+    if out.exists() and not _replaceable(out):
+        raise options.OptionsError(f"{out} holds something else than published weights: choose another --out")
+    facts, (params, config, input_spec) = pretrained.describe(source), pretrained.load(source)
+    arrays = pretrained.pack(params, dtype)
+    if len(arrays) > LARGEST:
+        hint = "; try --dtype=bfloat16" if dtype == "float32" else ""
+        raise checkpoint.CheckpointError(f"{source} makes {len(arrays):,} bytes, published weights have at most {LARGEST:,}{hint}")
+    rows, settings = _score_rows(score_files, source, config)
+    card = {
+        "version": pretrained.FORMAT_VERSION,
+        "name": out.name,
+        "licence": LICENCE,
+        "sha256": hashlib.sha256(arrays).hexdigest(),
+        "dtype": dtype,
+        "parameters": state.parameter_count(params),
+        "step": facts["step"],
+        "data": _data(config),
+        "training": {"seed": config["seed"], "steps": config["train"]["steps"], "selection": _selection(config)},
+        "commands": {"train": training_command(config), "evaluate": _evaluation_command(out)},
+        "scores": rows,
+        "robustness": _robustness(robustness, config["task"]["name"], source) if robustness else None,
+        "input_spec": input_spec,
+        "config": {**config, "eval": settings},
+    }
+    card = writers.plain(card)
+    _write(out, arrays, card)
+    return card
+
+
+def _replaceable(out: pathlib.Path) -> bool:
+    """Say whether a directory holds nothing, or published weights and nothing else."""
+    there = {path.name for path in out.iterdir()} if out.is_dir() else {""}
+    return not there or (pretrained.is_published(out) and there <= {pretrained.ARRAYS, pretrained.CARD, README})
+
+
+def _read_json(path: str) -> Any:
+    try:
+        return json.loads(pathlib.Path(path).read_bytes())
+    except (OSError, ValueError) as error:
+        raise options.OptionsError(f"cannot read {path}: {error}") from error
+
+
+def _score_rows(files: Sequence[str], source: str, config: Mapping[str, Any]) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Read score files of `source`: the card's rows, and the config's `eval` group that repeats the first."""
+    rows, settings = [], []
+    for file in files:
+        found = _read_json(file)
+        try:
+            if found["agent"] != "policy" or not _same_place(found["checkpoint"], source):
+                raise options.OptionsError(f"{file} holds scores of {found['checkpoint'] or found['agent']}, not of {source}")
+            changed = pretrained.differences(found["config"], config)
+            if changed:
+                raise options.OptionsError(f"{file} holds scores of another {', '.join(changed)}, here: {source}")
+            rows.append({**_row(found, ("split", "seeds", "device"), file), "file": file})
+            place = {"split": found["split"], "start": _start(found), "episodes": found["episodes"]}
+            settings.append({**found["config"]["eval"], **place})
+        except (KeyError, TypeError) as error:
+            raise options.OptionsError(f"{file} is no file of scores: {type(error).__name__} {error}") from error
+    return rows, settings[0]
+
+
+def _same_place(one: str | None, other: str) -> bool:
+    return one is not None and os.path.abspath(pretrained.find(one)) == os.path.abspath(pretrained.find(other))
+
+
+def _start(found: Mapping[str, Any]) -> int:
+    """Give the place of a score file's first seed in its split: the inverse of `build.split_seeds`."""
+    first, last = found["seeds"]
+    start = first - build.TEST_START if found["split"] == "test" else first // 2
+    seeds = build.split_seeds(found["split"], start, found["episodes"])
+    if [seeds[0], seeds[-1]] != [first, last]:
+        raise options.OptionsError(f"{found['episodes']} episodes of the {found['split']} split are not seeds {first} to {last}")
+    return start
+
+
+def _data(config: Mapping[str, Any]) -> dict[str, Any]:
+    task, mistakes = build.task(config), build.mistakes(config)
+    return {
+        "task": task.name,
+        "objects": task.num_objects,
+        "colors": task.colors,
+        "distractors": task.distractors,
+        "demonstrations": config["data"]["demos"],
+        "mistakes": mistakes,
+        "seeds": "the first even numbers (0, 2, 4, ...) whose scene the oracle solves; val is odd, both below 10 000, test from 10 001 on",
+    }
+
+
+def _selection(config: Mapping[str, Any]) -> str:
+    seeds = build.split_seeds("val", build.SELECTION_START, config["train"]["eval_episodes"])
+    return f"best score on val seeds {seeds[0]} to {seeds[-1]}, every {config['train']['eval_every']} steps"
+
+
+def training_command(config: Mapping[str, Any]) -> str:
+    """Compose the command that trains what `config` (as JSON holds it) describes: its task's config file and what differs from it."""
+    file = f"configs/{config['task']['name']}.py"
+    given, usual = (
+        train.run_settings(fields)
+        | {f"train.{name}": fields["train"][name] for name in ("eval_every", "eval_episodes")}  # they choose the best checkpoint
+        | {"data.directory": fields["data"]["directory"]}
+        for fields in (config, writers.plain(options.to_dict(options.load(file))))
+    )
+    changed = {name: value for name, value in given.items() if name not in usual or usual[name] != value}
+    if os.path.isabs(changed.get("data.directory", "")):  # where demonstrations lie on this machine
+        del changed["data.directory"]
+    flags = [shlex.quote(f"--config.{name}={tuple(value) if isinstance(value, list) else value}") for name, value in changed.items()]
+    return " ".join(["python -m lala_jax.train", f"--config={file}", *flags, f"--workdir=runs/{config['task']['name']}"])
+
+
+def _evaluation_command(out: pathlib.Path) -> str:
+    place = f"{pretrained.PREFIX}/{out.name}" if out.resolve().parent == pretrained.WEIGHTS else out.as_posix()
+    return f"python -m lala_jax.evaluate --checkpoint={shlex.quote(place)}"
+
+
+def _robustness(file: str, task: str, source: str) -> dict[str, Any]:
+    """Read the scores in other worlds: a mapping, or its field `conditions`, from the world to its scores."""
+    found = _read_json(file)
+    try:
+        if found.get("task", task) != task or not _same_place(found.get("checkpoint", source), source):
+            there = f"{found.get('task', task)}, {found.get('checkpoint', source)}"
+            raise options.OptionsError(f"{file} holds scores of {there}, not of {task}, {source}")
+        rows = [{"condition": name, **_row(row, (), file)} for name, row in found.get("conditions", found).items()]
+    except (KeyError, TypeError, AttributeError) as error:
+        raise options.OptionsError(f"{file} is no table of conditions: {type(error).__name__} {error}") from error
+    return {"file": file, "split": found.get("split"), "conditions": rows}
+
+
+def _row(found: Mapping[str, Any], more: Sequence[str], file: str) -> dict[str, Any]:
+    """Pick the fields of a score that a card keeps."""
+    if None in found["interval95"]:
+        raise options.OptionsError(f"{file} has a score without an interval: evaluate more episodes")
+    return {name: found[name] for name in (*more, *SCORE)}
+
+
+def _write(out: pathlib.Path, arrays: bytes, card: Mapping[str, Any]) -> None:
+    """Write the files beside `out` and rename them into place as one directory."""
+    temporary, old = (out.with_name(out.name + suffix) for suffix in (".tmp", ".old"))
+    for left in (temporary, old):
+        shutil.rmtree(left, ignore_errors=True)
+    try:
+        for name, content in ((pretrained.ARRAYS, arrays), (README, model_card(card).encode())):
+            with writers.atomic(temporary / name) as file:
+                file.write(content)
+        writers.write_json(temporary / pretrained.CARD, card)
+        if out.exists():
+            os.replace(out, old)
+        os.replace(temporary, out)
+    except BaseException:
+        if old.exists() and not out.exists():
+            os.replace(old, out)
+        raise
+    finally:
+        for left in (temporary, old):
+            shutil.rmtree(left, ignore_errors=True)
+
+
+def model_card(card: Mapping[str, Any]) -> str:
+    """Write a card for people: what this is, from what, how good, and what it cannot do."""
+    data, training, spec = card["data"], card["training"], card["input_spec"]["map"]
+    camera, model = card["config"]["camera"], card["config"]["model"]
+    more = f", and {data['distractors']} objects that the goal does not show" if data["distractors"] else ""
+    spoiled = f" {data['mistakes']:.0%} of their actions are spoiled, so that they show how to recover." if data["mistakes"] else ""
+    scores = [
+        f"| {row['split']} | {row['seeds'][0]} to {row['seeds'][1]} | {row['episodes']} | {_score(row)} | `{row['file']}` |"
+        for row in card["scores"]
+    ]
+    rounding = (
+        " The parameters are rounded to bfloat16 and computed with in float32; a score may be from before the rounding."
+        if card["dtype"] == "bfloat16"
+        else ""
+    )
+    parts = [
+        f"# {card['name']}: a policy of lala_jax",
+        "Made from `card.json` by `lala_jax.publish`; change neither by hand.",
+        "## Model",
+        f"Goal-conditioned pick and place (`model.name={model['name']}`): two top-down maps of {spec['rows']} x {spec['cols']} cells with "
+        f"{spec['slices']} height slices, the table now and the finished assembly, to one pick and one place. {card['parameters']:,} "
+        f"parameters, the moving average after {card['step']} of {training['steps']} steps.{rounding}",
+        "## Intended use",
+        f"The simulated task `{data['task']}` of lala_jax with {data['objects']} objects{more}, colours `{data['colors']}`, cameras "
+        f"`{camera['preset']}` at {camera['height']} x {camera['width']} pixels: research, comparison, a start for further training.",
+        "```bash\n" + card["commands"]["evaluate"] + "\n```",
+        "repeats the first score below and says whether it is the same.",
+        "## Data and training",
+        f"{data['demonstrations']} demonstrations of the scripted oracle in simulation; no other data, no pretrained parts.{spoiled} Their "
+        f"seeds: {data['seeds']}. Training seed {training['seed']}. The checkpoint was chosen by {training['selection']}.",
+        "```bash\n" + card["commands"]["train"] + "\n```",
+        "## Scores",
+        "Share of objects at their goal when the episode ends, 0 to 100, with the normal 95% interval over episodes.",
+        "\n".join(["| split | seeds | episodes | score | complete | file |", "|---|---|---|---|---|---|", *scores]),
+        *_other_worlds(card["robustness"]),
+        "## Limits",
+        "Simulation only: never run on a robot or on pictures of real cameras. Objects are upright boxes, actions are vertical. One "
+        "training seed: the intervals do not say how much another training would differ. For a misplaced object, the demonstrations "
+        + ("show few ways to recover." if data["mistakes"] else "never show how to recover."),
+        "## Licence",
+        f"{card['licence']}, as the code.",
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _other_worlds(table: Mapping[str, Any] | None) -> list[str]:
+    """Write the paragraphs on robustness."""
+    if table is None:
+        return []
+    split = f", {table['split']} split" if table["split"] else ""
+    rows = [f"| {row['condition']} | {row['episodes']} | {_score(row)} |" for row in table["conditions"]]
+    return [
+        "## Other worlds",
+        f"The same weights where something is not as in training (`{table['file']}`{split}).",
+        "\n".join(["| world | episodes | score | complete |", "|---|---|---|---|", *rows]),
+    ]
+
+
+def _score(row: Mapping[str, Any]) -> str:
+    low, high = row["interval95"]
+    return f"{row['score']:.1f} [{low:.1f}, {high:.1f}] | {row['complete_percent']:.0f}%"
+
+
+if __name__ == "__main__":
+    options.run(
+        main,
+        flags={"checkpoint": "", "scores": "", "out": "", "dtype": "float32", "robustness": ""},
+        config_from=stored_config,
+        workdir=build.WORKDIR,
+        user_errors=build.USER_ERRORS,
+    )

@@ -1,0 +1,265 @@
+"""The experiments: every row's config builds, finished rows are kept, intervals are what they say, and one series runs end to end."""
+
+import json
+
+import numpy as np
+import pytest
+from test_rollout import constant, run
+from test_scoring import SINGLE, save
+from test_train_step import tiny_config
+
+from experiments import ablation, common, main_table, robustness
+from lala_jax import build, observe, options, rollout, train, writers
+from lala_jax.sim import tasks
+
+SEEDS = [1, 3, 5]
+
+
+@pytest.fixture
+def unseen(monkeypatch):
+    """Observers are not asked to render, which takes seconds each."""
+    monkeypatch.setattr(observe.Observer, "check", lambda self: None)
+
+
+def shipped(task):
+    return common.shipped_config({"task": task})
+
+
+@pytest.mark.parametrize("module", [robustness, ablation])
+@pytest.mark.parametrize("task", tasks.names())
+def test_every_row_builds(module, task, unseen):
+    """A misspelt field or a wrong value is found here, and no row is another one's double."""
+    built = set()
+    for row in common.choose(module.ROWS, "", task):
+        for config in row.configs(shipped(task)):
+            built.add(json.dumps(options.to_dict(config)))
+            assert build.recipe(config).observer == build.observer(config)
+            if module is robustness:
+                assert build.build_policy(config) == build.build_policy(shipped(task))
+    assert len(built) == sum(len(row.parts) for row in common.choose(module.ROWS, "", task))
+
+
+def test_the_runs_of_the_main_table_build(unseen):
+    rows = main_table.plan([500, 50, 10], [0, 1, 2])
+    assert [row.name for row in rows] == ["500-0", "500-1", "500-2", "50-0", "10-0"]
+    configs = [row.configs(shipped("tower"))[0] for row in rows]
+    assert [(config.data.demos, config.seed) for config in configs] == [(500, 0), (500, 1), (500, 2), (50, 0), (10, 0)]
+    assert all(build.recipe(config).batch_size == 8 for config in configs)
+
+
+def test_rows_are_chosen_by_name():
+    assert [row.name for row in common.choose(robustness.ROWS, "noise", "tower")] == ["nominal", "noise"]
+    assert "tower-3" not in [row.name for row in common.choose(robustness.ROWS, "", "pallet")]
+    with pytest.raises(options.OptionsError, match="--rows must be one of 'nominal', .*got 'nois'; did you mean noise"):
+        common.choose(robustness.ROWS, "nois", "pallet")
+    with pytest.raises(options.OptionsError, match="--seeds must be whole numbers like 500,50,10, got '0,one'"):
+        common.numbers("--seeds", "0,one")
+    recoveries = next(row for row in ablation.ROWS if row.name == "recoveries").configs(shipped("pallet"))[0]
+    assert recoveries.data.directory == "data/pallet-mistakes"
+
+
+# Rows that are kept
+
+
+def row_like(name, score=50.0, **more):
+    return {"score": score, "interval95": [score, score], "complete_percent": 0.0, "scores": {"1": score}, **more}
+
+
+def filled(path, config, *rows, weights=None, fails=()):
+    """Fill a file with rows of changes to `config`: what was run, and the rows."""
+    ran = []
+
+    def job(row):
+        def work():
+            if row.name in fails:
+                raise KeyboardInterrupt
+            ran.append(row.name)
+            return row_like(row.name)
+
+        return common.Job(row.name, row.label, common.identity(row, config, SEEDS, weights=weights), work)
+
+    try:
+        done = common.fill(path, [job(row) for row in rows], lambda rows: {"count": len(rows)})
+    except KeyboardInterrupt:
+        done = None
+    return ran, done
+
+
+def test_finished_rows_are_kept_and_changed_ones_run_again(tmp_path):
+    path, config = tmp_path / "there" / "rows.json", tiny_config()
+    first, second, third = (common.Row(name, name, overrides) for name, overrides in [("a", ()), ("b", ("seed=3",)), ("c", ())])
+    assert filled(path, config, first, second, third, fails=("c",)) == (["a", "b"], None)  # stopped in the third
+    assert json.loads(path.read_text())["count"] == 2
+    ran, rows = filled(path, config, first, second, third)
+    assert ran == ["c"] and [row["name"] for row in rows] == ["a", "b", "c"]
+    assert filled(path, config, first, second, third)[0] == []
+    assert filled(path, config, first, common.Row("b", "another label", ("seed=4",)), third)[0] == ["b"]
+    stored = json.loads(path.read_text())["rows"]
+    assert [(row["name"], row["label"], row["overrides"]) for row in stored] == [
+        ("a", "a", [[]]),
+        ("b", "another label", [["seed=4"]]),
+        ("c", "c", [[]]),
+    ]
+    assert filled(path, config, third)[0] == [] and len(json.loads(path.read_text())["rows"]) == 3  # what was not asked for stays
+
+
+def test_what_identifies_a_row(tmp_path):
+    path, row = tmp_path / "rows.json", common.Row("a", "a")
+    weights = {"step": 3, "crc32": 7}
+
+    def ran(config=tiny_config(), **options):  # noqa: B008
+        return filled(path, config, row, **options)[0] == ["a"]
+
+    assert ran() and not ran()
+    assert not ran(tiny_config("eval.parallel=3", "data.threads=2", "train.log_every=9"))  # makes no difference
+    assert ran(tiny_config("camera.turn=1.0")) and ran()
+    assert ran(weights=weights) and not ran(weights=dict(weights)) and ran(weights={**weights, "crc32": 8}) and ran()
+    older = json.loads(path.read_text())
+    del older["rows"][0]["config"]["model"]["max_height"]  # the row is older than a field
+    path.write_text(json.dumps(older))
+    assert not ran()
+    assert not common.is_same(older["rows"][0], {**older["rows"][0], "seeds": [1, 7]})
+
+
+# Numbers
+
+
+def test_intervals_of_differences():
+    rng = np.random.default_rng(0)
+    a, b = rng.uniform(0, 100, 40), rng.uniform(0, 100, 40)
+    first, second = ({str(seed): value for seed, value in enumerate(values)} for values in (a, b))
+    paired = common.difference(first, dict(reversed(second.items())), paired=True)  # by seed, whatever the order
+    half = 1.96 * np.std(a - b, ddof=1) / np.sqrt(40)
+    np.testing.assert_allclose([paired["mean"], *paired["interval95"]], (a - b).mean() + np.array([0, -half, half]))
+    apart = common.difference(first, second, paired=False)
+    half = 1.96 * np.sqrt(np.var(a, ddof=1) / 40 + np.var(b, ddof=1) / 40)
+    np.testing.assert_allclose([apart["mean"], *apart["interval95"]], (a - b).mean() + np.array([0, -half, half]))
+    with pytest.raises(ValueError, match="the same seeds"):
+        common.difference(first, {"1": 2.0}, paired=True)
+
+
+def test_quarters_are_dealt_in_order():
+    assert common.shares(list(range(10)), 4) == [[0, 1, 2], [3, 4, 5], [6, 7], [8, 9]]
+    assert common.shares([7, 9], 4) == [[7], [9]]
+
+
+def test_merged_quarters_equal_one_summary():
+    task = tasks.get("tower", num_objects=2)
+    episodes = run(task, [0, 2]) + run(task, [4], constant(None))
+    scenes = [task.sample(6)]
+    episodes += rollout.run(task, scenes, [6], rollout.oracle_agent(task, scenes, [6], blind=True), threads=1)
+    parts = [[episodes[i] for i in share] for share in common.shares(range(4), 3)]
+    assert common.merged([rollout.summary(part) for part in parts]) == rollout.summary(episodes)
+    assert common.merged([rollout.summary(episodes)]) == rollout.summary(episodes)
+    row = common.row_of(rollout.summary(episodes))
+    assert row["scores"]["4"] == 0 and list(row["scores"]) == ["0", "2", "4", "6"] and "per_episode" not in row
+
+
+def test_which_worlds_have_the_same_scenes():
+    config = tiny_config()
+    same = {row.name: robustness.same_scenes(config, row.configs(config)[0], SEEDS) for row in robustness.ROWS}
+    assert {name for name, found in same.items() if not found} == {"colors", "tower-3", "tower-4", "tower-6"}
+
+
+def test_training_seconds_are_those_of_the_curve(tmp_path):
+    with writers.Writer(tmp_path, tensorboard=False) as writer:
+        for step, seconds in [(10, 3.0), (20, 1.0), (30, 1.0), (20, 2.0), (35, 1.0)]:  # stopped after 30, gone on from 10
+            writer.scalars(step, {"loss": 1.0, "seconds_per_step": seconds})
+            writer.scalars(step, {"val_score": 50.0})
+    assert common.train_seconds(tmp_path) == 10 * 3 + 10 * 2 + 10 * 1 + 5 * 1
+
+
+def test_tables():
+    text = common.table(["", "score"], [["a", common.with_interval(50, [40.04, 60])], ["b", common.with_interval(1, [None, None])]])
+    assert text.splitlines() == ["|  | score |", "| --- | --- |", "| a | 50.0 [40.0, 60.0] |", "| b | 1.0 |"]
+    assert common.with_interval(-2, [-3, 1], signed=True) == "-2.0 [-3.0, +1.0]"
+    assert common.counted({"wrong yaw": 1, "wrong place": 3, "none": 0}) == "3 wrong place, 1 wrong yaw"
+
+
+# Whole series
+
+
+@pytest.fixture
+def trains(monkeypatch):
+    """Training takes no time here: `(workdir, config)` of every run."""
+    runs = []
+
+    def fake(config, workdir):
+        runs.append((workdir, config))
+        with writers.Writer(workdir, tensorboard=False) as writer:
+            writer.scalars(config.train.steps, {"seconds_per_step": 2.0})
+        seeds = build.split_seeds(config.eval.split, config.eval.start, config.eval.episodes)
+        return told(seeds, 90.0 if config.model.multi_action else 60.0)
+
+    monkeypatch.setattr(train, "train_and_evaluate", fake)
+    return runs
+
+
+def told(seeds, score):
+    lines = [{"seed": s, "score": score + s % 4, "complete": False, "actions": 1, "causes": ["wrong yaw"]} for s in seeds]
+    counts = {name: {"wrong yaw": len(seeds)} for name in common.COUNTS}
+    scores = [line["score"] for line in lines]
+    return common.merged([{"per_episode": lines, "score": np.mean(scores), **counts}])
+
+
+def test_the_ablation_trains_each_row_once(trains, monkeypatch, tmp_path, capsys):
+    loaded = []
+    monkeypatch.setattr(common, "load_weights", lambda path, *_: (loaded.append(path), {"step": 5, "crc32": 1}))
+    monkeypatch.setattr(common, "score", lambda config, _, seeds: told(seeds, 95.0 if config.model.average_turns else 0.0))
+    given = ["--task=tower", "--steps=5", "--episodes=4", "--seed=2", f"--workdir={tmp_path / 'runs' / '<task>'}", f"--out={tmp_path}"]
+    rows = ablation.command([*given, "--rows=one-hot,average-turns"])
+    runs = tmp_path / "runs" / "tower"
+    assert [name for name, _ in trains] == [str(runs / "default"), str(runs / "one-hot")]
+    assert loaded == [str(runs / "default" / "checkpoints")]
+    for _, config in trains:
+        assert (config.train.steps, config.train.eval_every, config.seed, config.data.demos) == (5, 5, 2, 500)
+        assert (config.eval.split, config.eval.start, config.eval.episodes) == ("val", 100, 4)
+    assert [row["difference"]["mean"] for row in rows[1:]] == [-30, 5] and rows[1]["train_seconds"] == 10
+    stored = json.loads((tmp_path / "ablation-tower.json").read_text())
+    assert stored["steps"] == 5 and [row["seeds"] for row in stored["rows"]] == [[201, 207]] * 3
+    assert "| one-hot labels | 62.0 [60.9, 63.1] | 0% | -30.0 [-30.0, -30.0] | 10 |" in capsys.readouterr().out
+    ablation.command([*given, "--rows=one-hot,slices"])
+    assert [name for name, _ in trains[2:]] == [str(runs / "slices")]
+
+
+def test_the_main_table_averages_over_seeds(trains, tmp_path, capsys):
+    given = ["--demos=50,10", "--seeds=0,1", "--episodes=3", f"--workdir={tmp_path / 'runs' / '<task>'}", f"--out={tmp_path}"]
+    rows = main_table.command(given)
+    assert [name for name, _ in trains] == [str(tmp_path / "runs" / f"tower-{name}") for name in ("50-0", "50-1", "10-0")]
+    stored = json.loads((tmp_path / "main.json").read_text())
+    assert [row["seeds"] for row in stored["rows"]] == [[10_001, 10_003]] * 3 and stored["split"] == "test"
+    assert stored["means"][0]["train_seeds"] == [0, 1] and stored["means"][0]["score"] == rows[0]["score"]
+    assert stored["means"][0]["deviation"] == 0 and stored["means"][1]["deviation"] is None
+    assert "| 50 demonstrations, mean of 2 seeds | 92.0 (deviation 0.0) |" in capsys.readouterr().out
+    assert len(main_table.command(given)) == 3 and len(trains) == 3
+
+
+def test_robustness_end_to_end(tmp_path, capsys, monkeypatch):
+    """A policy that knows nothing in two worlds, one of them in parts; a second call runs nothing."""
+    save(tmp_path / "checkpoints", tiny_config(*SINGLE, "camera.calibrate=false"))
+    given = [f"--checkpoint={tmp_path / 'checkpoints'}", "--episodes=2", f"--out={tmp_path}", "--rows=missing"]
+    rows = robustness.command(given)
+    assert [row["name"] for row in rows] == ["nominal", "missing"]
+    stored = json.loads((tmp_path / "robustness-test.json").read_text())
+    assert stored["rows"] == rows and stored["reference"] == "nominal"
+    assert rows[1]["overrides"] == [[f"camera.missing={k}"] for k in range(4)]
+    for row in rows:
+        assert row["seeds"] == [10_001, 10_002] and list(row["scores"]) == ["10001", "10002"] and row["episodes"] == 2
+        assert sum(row["lost_objects"].values()) == 4 - sum(row["scores"].values()) / 50
+    assert rows[1]["drop"]["paired"] and "drop" not in rows[0]
+    assert stored["conditions"]["as trained"]["score"] == rows[0]["score"]
+    assert "| one camera of four missing, each in a quarter | " in capsys.readouterr().out
+    monkeypatch.setattr(common, "score", None)
+    assert robustness.command(given) == rows
+
+
+def test_a_wrong_request_ends_with_one_message(tmp_path, capsys):
+    for command, arguments, message in [
+        (robustness.command, [], "give --checkpoint=PATH"),
+        (robustness.command, [f"--checkpoint={tmp_path}"], "no checkpoint"),
+        (ablation.command, ["--task=castle"], "--task must be one of 'pallet', 'tower', got 'castle'"),
+        (main_table.command, ["--demos=many"], "--demos must be whole numbers"),
+    ]:
+        with pytest.raises(SystemExit, match="2"):
+            command(arguments)
+        assert message in capsys.readouterr().err
