@@ -22,7 +22,7 @@ MIDDLE = 0.5  # share of a face's sides within which a pick is taught, as the or
 QUARTER_NEAR = 0.03  # metres about the best place in which its quarter turns are looked for
 REFINE_DRAWS = 2  # times an object is held over its goal in a training example
 FIT_SCALE = 2.0  # logits per `goal_aware.MISFIT`
-REFINEMENTS = 2  # times a guess is refined
+PLACE_SHARE = 0.5  # what a place logit counts beside a fit when quarter turns are compared: both are log-odds of the same thing
 TOKEN_TOLERANCE = 0.008  # metres a goal voxel's centre may be outside the object it shows
 
 
@@ -282,15 +282,11 @@ class GoalAwarePolicy:
         cells, turns = self._guesses(place_logits)
         cell, turn = cells[0] + 0.5, turns[0].astype(jnp.float32)
         if self.refine:
-            limit = jnp.array([spec.rows, spec.cols])
-            at, turns, fit = cells + 0.5, turns.astype(jnp.float32), jnp.zeros(4)
-            for _ in range(REFINEMENTS):
-                start = jnp.clip(jnp.floor(at).astype(jnp.int32), 0, limit - 1)
-                offset, fit = self._refine(variables, layout, target, pick, start, turns)
-                offset = jnp.clip(offset, -2.0, 2.0)
-                at, turns = jnp.clip(start + 0.5 + offset[:, :2], 0.0, limit), turns + offset[:, 2]
-            best = fit.argmax()  # the first, the best place, where none fits better
-            cell, turn = at[best], turns[best]
+            offset, fit = self._refine(variables, layout, target, pick, cells, turns.astype(jnp.float32))
+            best = (FIT_SCALE * fit + PLACE_SHARE * place_logits[turns, cells[:, 0], cells[:, 1]]).argmax()
+            offset = jnp.clip(offset[best], -2.0, 2.0)
+            cell = jnp.clip(cells[best] + 0.5 + offset[:2], 0.0, jnp.array([spec.rows, spec.cols]))
+            turn = turns[best] + offset[2]
         yaw = turn * (2 * math.pi / model.rotations)
         return _to_action(spec, current, pick, types.world_from_cell(spec, cell), yaw), Heatmaps(pick_logits, place_logits)
 

@@ -144,7 +144,7 @@ def refused(answer, *messages):
         ("train.batch_size=0", ["config field train.batch_size must be above 0, got 0"]),
         ("task.name=castle", ["task.name must be one of 'pallet', 'tower', got 'castle'"]),
         ("task.num_objects=9", ["num_objects=9 is not one of 1..6"]),
-        ("task.colors=loud", ["task.colors must be one of 'paper', 'code', got 'loud'"]),
+        ("task.colors=loud", ["task.colors must be one of 'paper', 'code', 'uniform', got 'loud'"]),
         ("camera.preset=moon", ["camera.preset must be one of 'ring', 'paper', got 'moon'"]),
         ("model.name=lstm", ["model.name must be one of 'goal_aware', 'single', .*got 'lstm'"]),
         ("model.crop=6", ["goal_aware needs map rows, map cols and model.crop in multiples of 4, got 80, 40 and 6"]),

@@ -91,7 +91,7 @@ def test_finished_rows_are_kept_and_changed_ones_run_again(tmp_path):
     assert filled(path, config, first, second, third, fails=("c",)) == (["a", "b"], None)  # stopped in the third
     assert json.loads(path.read_text())["count"] == 2
     ran, rows = filled(path, config, first, second, third)
-    assert ran == ["c"] and [row["name"] for row in rows] == ["a", "b", "c"]
+    assert ran == ["c"] and [row["name"] for row in rows or ()] == ["a", "b", "c"]
     assert filled(path, config, first, second, third)[0] == []
     assert filled(path, config, first, common.Row("b", "another label", ("seed=4",)), third)[0] == ["b"]
     stored = json.loads(path.read_text())["rows"]

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from test_train_step import tiny_config
 
-from lala_jax import build, checkpoint, options, rollout, scoring
+from lala_jax import build, checkpoint, options, pictures, rollout, scoring, types
+from lala_jax.sim import render, scene
 
 SINGLE = ("model.name=single", "model.stages=1", "model.multi_action=false")
 SEEDS = [1, 3, 5]
@@ -45,17 +46,17 @@ def scored(built, *, parallel, strips=0):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(rollout, "run", run)
-        summary, pictures = scoring.evaluate(
+        summary, drawn = scoring.evaluate(
             *built, seeds=SEEDS, parallel=parallel, threads=1, strips=strips, progress=lambda done, total: said.append((done, total))
         )
     assert said[-1] == (3, 3)
-    return summary, pictures, episodes
+    return summary, drawn, episodes
 
 
 @pytest.mark.parametrize("parallel", [2, 3])  # 2 leaves an episode over, which is padded
 def test_parallel_changes_nothing(built, alone, parallel):
-    summary, pictures, episodes = scored(built, parallel=parallel)
-    assert summary == alone[0] and pictures == []
+    summary, drawn, episodes = scored(built, parallel=parallel)
+    assert summary == alone[0] and drawn == {}
     assert [episode.seed for episode in episodes] == SEEDS
     for one, many in zip(alone[2], episodes, strict=True):
         assert len(one.actions) == len(many.actions) > 0
@@ -72,23 +73,51 @@ def test_summary_counts_what_happened(alone):
     assert [line["seed"] for line in summary["per_episode"]] == SEEDS
 
 
-def test_strips_are_drawn_for_the_first_episodes(alone):
-    _, pictures, episodes = alone
-    assert len(pictures) == 2
-    for picture, episode in zip(pictures, episodes, strict=False):
+def test_strips_are_drawn_for_the_first_episodes_and_the_first_failures(alone):
+    """Also where the cameras were calibrated; what failed among the first is drawn once and has both names."""
+    _, drawn, episodes = alone
+    failed = [i for i, episode in enumerate(episodes) if episode.score < 100][: scoring.FAILURES]
+    assert sorted(drawn) == [("episode", 0), ("episode", 1), *(("failure", n) for n in range(len(failed)))]
+    for (kind, number), picture in drawn.items():
+        episode = episodes[failed[number] if kind == "failure" else number]
         assert picture.dtype == np.uint8 and picture.ndim == 3 and picture.shape[-1] == 3
         assert picture.shape[0] > 100 * len(episode.actions) or picture.shape[1] > 100 * len(episode.actions)
         assert np.ptp(picture) > 100
 
 
+@pytest.mark.parametrize("changes", [("camera.calibrate=false",), ("camera.shift=0.03", "camera.turn=3.0")])
+def test_episodes_are_drawn_as_their_own_cameras_saw_them(built, changes):
+    """Of a batch of three the second is drawn: its views, its goal, and the thoughts that led to its actions."""
+    agent, params, _ = built
+    observer = build.observer(tiny_config(*SINGLE, *changes))
+    scenes = [observer.task.sample(seed) for seed in SEEDS]
+    actor = scoring.PolicyAgent(agent, params, observer, scenes, parallel=3, key=jax.random.key(0))
+    episode = rollout.run(observer.task, scenes, SEEDS, actor, threads=1)[1]
+    moments = [(1, poses) for poses in episode.poses[:-1]]
+    for action, (_, heat) in zip(episode.actions, actor.think_again(moments), strict=True):
+        cell = np.unravel_index(np.argmax(heat.pick), heat.pick.shape)
+        np.testing.assert_allclose(types.world_from_index(observer.spec, np.array(cell)), action.pick[:2], atol=1e-5)
+    seen = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pictures, "episode_strip", lambda panels, final, goal, caption: seen.append((len(panels), goal)))
+        scoring.episode_pictures(actor, {1: episode})
+    count, goal = seen[0]
+    camera = observer.camera if actor.rig is None else jax.tree.map(lambda leaf: leaf[1], actor.rig.camera)
+    model, data = scene.geom_template(observer.task)
+    told = scenes[1]
+    full = render.render(*scene.place(model, data, size=told.size, color=told.color, poses=told.goal, base=told.base), camera)
+    assert count == len(episode.actions) and np.mean(np.abs(goal.rgb - full.rgb).max(-1) > 0.02) < 0.01
+
+
 def test_scores_and_pictures_are_written(alone, tmp_path, capsys):
-    summary, pictures, _ = alone
+    summary, drawn, _ = alone
     config = tiny_config(*SINGLE)
-    scoring.write_scores(config, summary, pictures, tmp_path, agent="policy", split="val", seeds=SEEDS, source="there")
+    scoring.write_scores(config, summary, drawn, tmp_path, agent="policy", split="val", seeds=SEEDS, source="there")
     stored = json.loads((tmp_path / "scores-policy-val.json").read_text())
     assert stored["score"] == summary["score"] and stored["seeds"] == [1, 5] and stored["checkpoint"] == "there"
     assert options.to_dict(options.from_dict(stored["config"])) == options.to_dict(config)
-    assert sorted(path.name for path in tmp_path.glob("*.webp")) == ["episode-val-0.webp", "episode-val-1.webp"]
+    names = sorted(f"{kind}-val-{number}.webp" for kind, number in drawn)
+    assert sorted(path.name for path in tmp_path.glob("*.webp")) == names and "episode-val-1.webp" in names
     assert f"score {summary['score']:.1f}" in capsys.readouterr().out
 
 
