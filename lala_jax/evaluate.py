@@ -19,7 +19,7 @@ NO_CHECKPOINT = "give --checkpoint=PATH, or --config=FILE.py with --agent=oracle
 def main(config, workdir, *, checkpoint: str, agent: str, split: str, start: int, episodes: int) -> dict[str, Any]:
     """Score the checkpoint, or the oracle or the blind agent, and write scores and pictures to the work directory."""
     options.check_choice("--agent", agent, scoring.AGENTS)
-    split, threads, strips = split or config.eval.split, config.data.threads, []
+    split, threads, strips = split or config.eval.split, config.data.threads, {}
     seeds = build.split_seeds(split, start if start >= 0 else config.eval.start, episodes or config.eval.episodes)
     if agent == "policy":
         if not checkpoint:

@@ -116,7 +116,7 @@ class Observer:
             def measure(points):
                 return distance.distance(model, data, points, geoms=static)
 
-            believed = jax.lax.map(lambda one: calibration.calibrate(*one, measure), (views.depth, believed))
+            believed = jax.lax.map(lambda one: calibration.calibrate(one[0], one[1], measure), (views.depth, believed))
         return Rig(camera, believed, layer)
 
     def check(self) -> None:

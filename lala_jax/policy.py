@@ -246,7 +246,11 @@ class GoalAwarePolicy:
 
     def _refine(self, variables, layout, target, pick, cells, turns):
         """Refine H guesses, `cells` `[H, 2]` and `turns` `[H]`: offsets `[H, 3]` and how well they fit `[H]`."""
-        return jax.vmap(lambda cell, turn: self.model.apply(variables, layout, target, pick, cell, turn, method="refine"))(cells, turns)
+
+        def one(cell, turn) -> tuple[jax.Array, jax.Array]:
+            return self.model.apply(variables, layout, target, pick, cell, turn, method="refine")
+
+        return jax.vmap(one)(cells, turns)
 
     def _guesses(self, logits):
         """Give the best place, and the best places near it that are turned by one to three quarters: cells `[4, 2]` and bins `[4]`."""

@@ -18,7 +18,7 @@ import shutil
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from lala_jax import build, checkpoint, evaluate, options, pretrained, state, train, writers
+from lala_jax import build, checkpoint, options, pretrained, state, writers
 
 LARGEST = 12_000_000  # bytes of weights.npz
 LICENCE = "Apache-2.0"
@@ -41,7 +41,7 @@ def stored_config(flags: Mapping[str, Any]):
     missing = [f"--{name}=PATH" for name in ("checkpoint", "scores", "out") if not flags[name]]
     if missing:
         raise options.OptionsError(f"give {' and '.join(missing)}")
-    return evaluate.stored_config(flags)
+    return options.from_dict(pretrained.describe(flags["checkpoint"])["config"])
 
 
 def publish(
@@ -151,7 +151,7 @@ def training_command(config: Mapping[str, Any]) -> str:
     """Compose the command that trains what `config` (as JSON holds it) describes: its task's config file and what differs from it."""
     file = f"configs/{config['task']['name']}.py"
     given, usual = (
-        train.run_settings(fields)
+        build.run_settings(fields)
         | {f"train.{name}": fields["train"][name] for name in ("eval_every", "eval_episodes")}  # they choose the best checkpoint
         | {"data.directory": fields["data"]["directory"]}
         for fields in (config, writers.plain(options.to_dict(options.load(file))))

@@ -50,21 +50,14 @@ def start_or_resume(config: Mapping[str, Any], recipe: train_step.Recipe, store:
     found = store.restore_latest(fresh)
     if found is None:
         return fresh
-    there = run_settings(checkpoint.describe(store.directory / "latest" / str(found[0]))["config"])
-    here = run_settings(writers.plain(options.to_dict(config)))
+    there = build.run_settings(checkpoint.describe(store.directory / "latest" / str(found[0]))["config"])
+    here = build.run_settings(writers.plain(options.to_dict(config)))
     changed = [
         f"{name} ({there.get(name)} there, {here.get(name)} here)" for name in sorted(there | here) if there.get(name) != here.get(name)
     ]
     if changed:
         raise checkpoint.CheckpointError(f"{store.directory} holds a run with another {', '.join(changed)}: choose another --workdir")
     return found[1]
-
-
-def run_settings(config: Mapping[str, Any]) -> dict[str, Any]:
-    """List the fields that make a run what it is, by dotted name: all but those that say how often to report and where data lie."""
-    free = ("eval.", "data.directory", "data.threads", "train.log_every", "train.save_every", "train.eval_every", "train.eval_episodes")
-    flat = {f"{group}.{name}": value for group, fields in config.items() if group != "seed" for name, value in fields.items()}
-    return {"seed": config["seed"]} | {name: value for name, value in flat.items() if not name.startswith(free)}
 
 
 def train_and_evaluate(config, workdir: str) -> dict[str, Any]:

@@ -54,8 +54,11 @@ def observations(recipe: Recipe, key: jax.Array, examples: types.State) -> tuple
     views = observer.look(facts, color, stand, poses, key=key_look)
     if recipe.sensors:
         pair = jax.random.split(key_errors, size)
-        keys = jnp.concatenate([pair, pair]), jax.random.split(key_noise, 2 * size)
-        views = jax.vmap(lambda *one: augment.sensors(*one, recipe.sensors, disparity=observer.disparity))(*keys, views)
+
+        def err(key, key_noise, one):
+            return augment.sensors(key, key_noise, one, recipe.sensors, disparity=observer.disparity)
+
+        views = jax.vmap(err)(jnp.concatenate([pair, pair]), jax.random.split(key_noise, 2 * size), views)
     maps = topdown.from_views_batch(views, spec=observer.spec)
     return jax.tree.map(lambda x: x[:size], maps), jax.tree.map(lambda x: x[size:], maps)
 

@@ -273,25 +273,33 @@ def test_act_keeps_the_best_place_where_none_fits_better():
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), again, action)
 
 
-def test_act_refines_from_where_the_first_refinement_led():
-    """The second starts at the cell and the turn of the first: what moves halfway ends at three quarters; no step is over two cells."""
-    wanted = np.array([53.2, 18.9])
+@pytest.mark.parametrize(("better", "chosen"), [(0.9, 0), (1.1, 3)])
+def test_act_weighs_the_fit_against_the_place(better, chosen):
+    """Of two quarter turns that one takes whose fit and place together say more: here the place's lead is worth `worth` of a fit."""
+    worth = policy.PLACE_SHARE * (PLACES[0][1] - PLACES[3][1]) / policy.FIT_SCALE
 
-    def halfway(pick, cell, turns):
-        del pick
-        off = jnp.append((wanted - (cell + 0.5)) / 2, (2.0 - turns) / 2)
-        return off, -jnp.abs(turns - 2.0)
+    def fits(pick, cell, turns):
+        del pick, cell
+        return jnp.zeros(3), jnp.where(turns == 10, better * worth, jnp.where(turns == 1, 0.0, -9.0))
 
-    action, _ = act_canned(place=PLACES[:1], refine=halfway)
-    first = np.array([50.5, 20.5]) + np.clip((wanted - np.array([50.5, 20.5])) / 2, -2, 2)
-    cell = np.floor(first) + 0.5
-    np.testing.assert_allclose(types.cell_from_world(SPEC, action.place[:2]), cell + (wanted - cell) / 2, atol=1e-3)
-    assert abs(transforms.wrap_angle(action.yaw - 1.75 * math.pi / 6)) < 1e-5
-    action, _ = act_canned(place=PLACES[:1], refine=lambda *_: (jnp.array([9.0, -9.0, 9.0]), jnp.float32(0)))
-    np.testing.assert_allclose(types.cell_from_world(SPEC, action.place[:2]), [54.5, 16.5], atol=1e-3)
-    assert abs(transforms.wrap_angle(action.yaw - 5 * math.pi / 6)) < 1e-5
-    action, _ = act_canned(place=(((1, 0, 39), 3.0),), refine=lambda *_: (jnp.array([-2.0, 2.0, 0.0]), jnp.float32(0)))
-    np.testing.assert_allclose(types.cell_from_world(SPEC, action.place[:2]), [0, 40], atol=1e-3)  # not off the map
+    action, _ = act_canned(place=PLACES, refine=fits)
+    np.testing.assert_allclose(action.place[:2], types.world_from_index(SPEC, np.array(PLACES[chosen][0][1:])), atol=1e-6)
+
+
+def test_act_refines_by_what_the_chosen_guess_says():
+    """By any fraction of a cell and a bin, but no more than two, nor off the map."""
+
+    def by(*off):
+        return lambda pick, cell, turns: (jnp.where(turns == 1, jnp.array(off), 1.0), jnp.where(turns == 1, 0.0, -9.0))
+
+    for place, off, cell, turn in (
+        (PLACES, (0.3, -1.7, 0.4), (50.8, 18.8), 1.4),
+        (PLACES, (9.0, -9.0, -9.0), (52.5, 18.5), -1),
+        ((((1, 0, 39), 3.0),), (-2.0, 2.0, 0.0), (0, 40), 1),
+    ):
+        action, _ = act_canned(place=place, refine=by(*off))
+        np.testing.assert_allclose(types.cell_from_world(SPEC, action.place[:2]), cell, atol=1e-3)
+        assert abs(transforms.wrap_angle(action.yaw - turn * math.pi / 6)) < 1e-5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -353,15 +361,14 @@ def test_switches_take_their_losses_along():
     """No program is compiled: the names of the metrics are enough."""
     named = {"loss", "loss_pick", "loss_place", "pick_right", "place_right", "place_near"}
     matching, refining = {"loss_match", "loss_next", "match_right"}, {"loss_refine", "loss_fit", "refine_error", "fit_right"}
-    blunt = GOAL_AWARE.clone(matching=False)
+    blunt, blank = GOAL_AWARE.clone(matching=False), policy.empty_map(SPEC)
+    params = jax.eval_shape(POLICIES["goal_aware"].init, jax.random.key(0))
     for agent, names in (
         (policy.GoalAwarePolicy(model=GOAL_AWARE), named | matching | refining),
         (policy.GoalAwarePolicy(model=GOAL_AWARE, match_weight=0.0), named | refining),
         (policy.GoalAwarePolicy(model=blunt), named | refining),
         (policy.GoalAwarePolicy(model=GOAL_AWARE, refine=False), named | matching),
     ):
-        blank = policy.empty_map(SPEC)
-        params = jax.eval_shape(agent.init, jax.random.key(0))
         loss, metrics = jax.eval_shape(agent.loss, params, jax.random.key(0), state_of(0), blank, blank)
         assert set(metrics) == names and loss.shape == ()
 
@@ -410,12 +417,13 @@ def test_transporters_lose_finitely_and_act_on_the_map(name):
 def test_goal_aware_learns_a_batch_by_heart():
     """Law 7: pick, place, match and fit of one batch are learnt; the gradient reaches every parameter; then the actions are right.
 
-    The second example's object is oblong: its quarter turn, which covers much of the same place, is wrong. Every step draws other
-    picks and other starts of the refinement.
+    The second example's object is oblong: its quarter turn, which covers much of the same place, is wrong. Four draws of picks and of
+    starts of the refinement take turns.
     """
     agent = POLICIES["goal_aware"]
     examples = [example(0), example(4, done=1, sides=(0.07, 0.04))]
     _, *batch = batch_of(*examples)
+    keys = [jax.random.split(jax.random.key(seed), len(examples)) for seed in range(4)]
     optimizer = optax.adam(3e-3)
     params, act = compiled("goal_aware")
     opt_state = optimizer.init(params)
@@ -426,16 +434,18 @@ def test_goal_aware_learns_a_batch_by_heart():
         updates, opt_state = optimizer.update(grads, opt_state)
         return optax.apply_updates(params, updates), opt_state, metrics, jax.tree.map(lambda g: jnp.abs(g).max(), grads)
 
-    first = None
+    seen = []
     for number in range(201):
-        keys = jax.random.split(jax.random.fold_in(jax.random.key(2), number), len(examples))
-        params, opt_state, metrics, size = step(params, opt_state, keys, *batch)
-        first = first or metrics
+        params, opt_state, metrics, size = step(params, opt_state, keys[number % 4], *batch)
+        seen = [*seen, metrics]
         if number == 20:
             dead = [jax.tree_util.keystr(path) for path, leaf in jax.tree.leaves_with_path(size) if not leaf > 0]
             assert not dead, f"no gradient reaches {dead}"
-        print(number, {k: round(float(v), 3) for k, v in metrics.items()}) if number % 20 == 0 else 0
-    metrics = {name: float(value) for name, value in metrics.items()}
+        if number % 20 == 19:
+            recent = {name: float(np.mean([one[name] for one in seen[-4:]])) for name in metrics}
+            if max(recent["loss_pick"], recent["loss_place"], recent["loss_refine"]) < 0.1:
+                break
+    metrics, first = ({name: float(np.mean([one[name] for one in those])) for name in metrics} for those in (seen[-4:], seen[:4]))
     assert metrics["loss_pick"] < 0.3 and metrics["loss_place"] < 0.3, metrics
     assert all(metrics[name] < 0.7 * first[name] for name in ("loss_match", "loss_next", "loss_refine", "loss_fit")), metrics
     assert metrics["pick_right"] == metrics["place_right"] == metrics["fit_right"] == 1
@@ -446,6 +456,6 @@ def test_goal_aware_learns_a_batch_by_heart():
         held = np.asarray(state.poses[ready, :2] - action.pick[:2])
         cos, sin = np.cos(action.yaw), np.sin(action.yaw)
         landed = np.asarray(action.place[:2]) + np.array([[cos, -sin], [sin, cos]]) @ held
-        print(np.linalg.norm(landed - np.asarray(state.goal[ready, :2])))
+        assert np.linalg.norm(landed - np.asarray(state.goal[ready, :2])) < 0.01
         off = transforms.yaw_from_quat(state.poses[ready, 3:]) + action.yaw - transforms.yaw_from_quat(state.goal[ready, 3:])
-        print(abs(float(transforms.wrap_angle(off, state.symmetry[ready]))))
+        assert abs(float(transforms.wrap_angle(off, state.symmetry[ready]))) < math.radians(15)

@@ -13,7 +13,7 @@ import pytest
 from test_scoring import SINGLE, drawn_params
 from test_train_step import tiny_config
 
-from lala_jax import build, checkpoint, evaluate, options, pretrained, publish, scoring, train, writers
+from lala_jax import build, checkpoint, evaluate, options, pretrained, publish, scoring, writers
 
 SEEDS = [10_002, 10_003]
 
@@ -59,7 +59,7 @@ def test_float32_comes_back_bit_for_bit(run, published):
     params, config, input_spec = pretrained.load(published)
     assert bits(params) == bits(run[2]) and jax.tree.structure(params) == jax.tree.structure(run[2])
     assert input_spec == writers.plain(build.input_spec(tiny()))
-    assert train.run_settings(config) == train.run_settings(writers.plain(options.to_dict(tiny())))
+    assert build.run_settings(config) == build.run_settings(writers.plain(options.to_dict(tiny())))
     assert (
         bits(pretrained.load(run[0])[0]) == bits(params)
         and pretrained.describe(run[0])["step"] == pretrained.describe(published)["step"] == 7
@@ -108,7 +108,7 @@ def test_the_training_command_trains_this(published):
     assert words[:3] == ["python", "-m", "lala_jax.train"]
     overrides = [word.removeprefix("--config.") for word in words if word.startswith("--config.")]
     config = options.load(words[3].removeprefix("--config="), overrides)
-    assert train.run_settings(writers.plain(options.to_dict(config))) == train.run_settings(card["config"])
+    assert build.run_settings(writers.plain(options.to_dict(config))) == build.run_settings(card["config"])
     usual = publish.training_command(writers.plain(options.to_dict(options.load("configs/pallet.py"))))
     assert usual == "python -m lala_jax.train --config=configs/pallet.py --workdir=runs/pallet"
 
