@@ -1,1 +1,1 @@
-"""The experiments behind the README's tables, run from a checkout: `python -m experiments.robustness` and so on. Not in the wheel."""
+"""Series of runs, some behind the README's tables, from a checkout: `python -m experiments.robustness` and so on. Not in the wheel."""

@@ -9,13 +9,12 @@ rows that are missing, and within a row where its training stopped; `--rows=refi
 from __future__ import annotations
 
 import dataclasses
-import functools
 import pathlib
 from collections.abc import Sequence
 from typing import Any
 
 from experiments import common
-from lala_jax import build, options, train
+from lala_jax import build, options
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,15 +56,8 @@ def main(
     config, workdir, *, task: str, steps: int, demos: int, start: int, episodes: int, seed: int, rows: str, out: str
 ) -> list[dict[str, Any]]:
     """Train and score a task's config with the levers of `ROWS`."""
-    base, seeds = (
-        budget(config, steps=steps, demos=demos, start=start, episodes=episodes, seed=seed),
-        build.split_seeds("val", start, episodes),
-    )
-    runs = pathlib.Path(build.workdir(config, workdir))
-    jobs = [
-        common.Job(row.name, row.label, common.identity(row, base, seeds, weights=None), functools.partial(run, row, base, runs, seeds))
-        for row in common.choose(ROWS, rows, task)
-    ]
+    base = budget(config, steps=steps, demos=demos, start=start, episodes=episodes, seed=seed)
+    seeds, runs = build.split_seeds("val", start, episodes), pathlib.Path(build.workdir(config, workdir))
 
     def finish(done: Sequence[dict[str, Any]]) -> dict[str, Any]:
         for row in done[1:]:
@@ -73,7 +65,8 @@ def main(
         return {"task": task, "split": "val", "steps": steps, "demos": demos, "seed": seed, "reference": done[0]["name"]}
 
     path = pathlib.Path(out) / f"ablation-{task}.json"
-    done = common.fill(path, jobs, finish)
+    chosen = common.choose(ROWS, rows, task)
+    done = common.fill(path, chosen, lambda row: run(row, base, runs, seeds), finish, config=base, seeds=seeds)
     print(f"\n{table(done)}\n\n{path}")
     return done
 
@@ -89,25 +82,14 @@ def run(row: Lever, base, runs: pathlib.Path, seeds: Sequence[int]) -> dict[str,
     """Train where the row has weights of its own, and score."""
     config = row.configs(base)[0]
     if row.trains:
-        summary = train.train_and_evaluate(config, str(runs / row.name))
-        return {**common.row_of(summary), "train_seconds": common.train_seconds(runs / row.name)}
-    checkpoint = runs / ROWS[0].name / "checkpoints"
-    params, weights = common.load_weights(str(checkpoint), config, build.build_policy(config))
+        return common.train_and_score(config, runs / row.name)
+    params, weights = common.load_weights(str(runs / ROWS[0].name / "checkpoints"), config)
     return {**common.row_of(common.score(config, params, seeds)), "train_seconds": 0.0, "weights": weights}
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
     """Write the rows as a Markdown table."""
-    lines = [
-        [
-            row["label"],
-            common.with_interval(row["score"], row["interval95"]),
-            f"{row['complete_percent']:.0f}%",
-            common.with_interval(row["difference"]["mean"], row["difference"]["interval95"], signed=True) if "difference" in row else "",
-            f"{row['train_seconds']:.0f}" if row["train_seconds"] else "",
-        ]
-        for row in rows
-    ]
+    lines = [[*common.cells(row, "difference"), f"{row['train_seconds']:.0f}" if row["train_seconds"] else ""] for row in rows]
     return common.table(["", "score", "complete", "difference", "training, s"], lines)
 
 

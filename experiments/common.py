@@ -6,7 +6,6 @@ Every file is `{"task", ..., "rows": [...]}`. A row has `name`, `label`, what id
 
 from __future__ import annotations
 
-import collections
 import dataclasses
 import itertools
 import json
@@ -24,7 +23,6 @@ from lala_jax import build, checkpoint, options, pretrained, rollout, scoring, t
 from lala_jax.sim import tasks
 
 USER_ERRORS = (*build.USER_ERRORS, train.NonFiniteError)
-COUNTS = ("actions_by_cause", "first_failures", "lost_objects", "failures_by_reason")  # of a summary
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,29 +44,11 @@ class Row:
         return [options.override(config, texts) for texts in self.changes(config)]
 
 
-@dataclasses.dataclass(frozen=True)
-class Job:
-    """A row to be filled in: `identity` (JSON) says what it is the result of, `run` gives its fields."""
-
-    name: str
-    label: str
-    identity: Mapping[str, Any]
-    run: Callable[[], Mapping[str, Any]]
-
-
 def choose(rows: Sequence, names: str, task: str) -> list:
     """Give the first row, with which the others are compared, and those of `names` (comma-separated, "" for all) that apply to the task."""
     valid = [row for row in rows if task in (row.tasks or (task,))]
     wanted = [options.check_choice("--rows", name, [row.name for row in valid]) for name in names.split(",") if name]
     return [row for row in valid if not wanted or row.name in wanted or row is valid[0]]
-
-
-def numbers(name: str, text: str) -> list[int]:
-    """Read a flag of comma-separated whole numbers."""
-    try:
-        return [int(part) for part in text.split(",")]
-    except ValueError:
-        raise options.OptionsError(f"{name} must be whole numbers like 500,50,10, got {text!r}") from None
 
 
 def identity(row: Row, config, seeds: Sequence[int], *, weights: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -84,24 +64,34 @@ def is_same(stored: Mapping[str, Any], wanted: Mapping[str, Any]) -> bool:
     return exact and all(there[name] == here[name] for name in there.keys() & here.keys())
 
 
-def fill(path: pathlib.Path, jobs: Sequence[Job], finish: Callable[[Sequence[dict[str, Any]]], Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Run the jobs whose rows are not in the file, which is written after each, and give all their rows.
+def fill(
+    path: pathlib.Path,
+    rows: Sequence[Row],
+    run: Callable[[Any], Mapping[str, Any]],
+    finish: Callable[[list[dict[str, Any]]], Mapping[str, Any]],
+    *,
+    config,
+    seeds: Sequence[int],
+    weights: Mapping[str, Any] | None = None,
+) -> list[dict[str, Any]]:
+    """Give the fields of all `rows`; those that are not in the file are run, and the file is written after each.
 
-    A row of the file with a job's name and another identity is run again and replaced, other rows stay. `finish` may add to the jobs'
+    A row of the file with a row's name and another `identity` is run again and replaced, other rows stay. `finish` may add to the
     finished rows, and gives the file's other fields.
     """
     stored = {row["name"]: row for row in json.loads(path.read_text())["rows"]} if path.exists() else {}
-    rows = []
-    for job in jobs:
-        row = stored.get(job.name)
-        if row is None or not is_same(row, job.identity):
-            print(f"{job.name}: {job.label}", flush=True)
-            begin, result, device = time.time(), job.run(), jax.devices()[0].device_kind
-            row = {"name": job.name, **result, "seconds": time.time() - begin, "device": device, **job.identity}
-        stored[job.name] = row | {"label": job.label}
-        rows.append(stored[job.name])
-        writers.write_json(path, {**finish(rows), "rows": list(stored.values())})
-    return rows
+    wanted = [identity(row, config, seeds, weights=weights) for row in rows]  # of all, before the first is run
+    done = []
+    for row, own in zip(rows, wanted, strict=True):
+        found = stored.get(row.name)
+        if found is None or not is_same(found, own):
+            print(f"{row.name}: {row.label}", flush=True)
+            begin, result, device = time.time(), run(row), jax.devices()[0].device_kind
+            found = {"name": row.name, **result, "seconds": time.time() - begin, "device": device, **own}
+        stored[row.name] = found | {"label": row.label}
+        done.append(stored[row.name])
+        writers.write_json(path, {**finish(done), "rows": list(stored.values())})
+    return done
 
 
 # Runs and scores
@@ -118,13 +108,17 @@ def train_seconds(workdir: pathlib.Path) -> float:
     return sum((step - before) * taken[step] for before, step in itertools.pairwise([0, *sorted(taken)]))
 
 
-def load_weights(path: str, config, agent) -> tuple[Any, dict[str, Any]]:
+def train_and_score(config, directory: pathlib.Path) -> dict[str, Any]:
+    """Train a run, or go on with it, and score it: the row's fields."""
+    summary = train.train_and_evaluate(config, str(directory))
+    return {**row_of(summary), "train_seconds": train_seconds(directory)}
+
+
+def load_weights(path: str, config) -> tuple[Any, dict[str, Any]]:
     """Load the averaged parameters of a checkpoint, and say what identifies them."""
-    params = scoring.check_checkpoint(path, config, agent)
-    crc = 0
-    for _, leaf in sorted(checkpoint.named(params).items()):
-        crc = zlib.crc32(np.ascontiguousarray(leaf).tobytes(), crc)
-    return params, {"step": pretrained.describe(path)["step"], "crc32": crc}
+    params = scoring.check_checkpoint(path, config, build.build_policy(config))
+    content = b"".join(np.asarray(leaf).tobytes() for _, leaf in sorted(checkpoint.named(params).items()))
+    return params, {"step": pretrained.describe(path)["step"], "crc32": zlib.crc32(content)}
 
 
 def score(config, params, seeds: Sequence[int]) -> dict[str, Any]:
@@ -133,35 +127,10 @@ def score(config, params, seeds: Sequence[int]) -> dict[str, Any]:
     def told(done, total):
         print(f"  {done} of {total} episodes", flush=True)
 
-    parallel = min(config.eval.parallel, len(seeds))
-    agent, observer = build.build_policy(config), build.observer(config)
-    options = {"seeds": seeds, "parallel": parallel, "threads": config.data.threads, "seed": config.seed}
-    return scoring.evaluate(agent, params, observer, progress=told, **options)[0]
-
-
-def shares(seeds: Sequence[int], count: int) -> list[list[int]]:
-    """Deal seeds in order to `count` parts as equal as can be."""
-    return [part.tolist() for part in np.array_split(np.asarray(seeds), count) if part.size]
-
-
-def merged(summaries: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Give the summary of all episodes from those of parts."""
-    lines = [line for summary in summaries for line in summary["per_episode"]]
-    scores = np.array([line["score"] for line in lines])
-    mean, half = float(scores.mean()), rollout.half_width(scores)
-    counts = {name: collections.Counter() for name in COUNTS}
-    for name, counter in counts.items():
-        for summary in summaries:
-            counter.update(summary[name])
-    return {
-        "episodes": len(lines),
-        "score": mean,
-        "interval95": [max(mean - half, 0.0), min(mean + half, 100.0)],
-        "complete_percent": 100.0 * float(np.mean([line["complete"] for line in lines])),
-        "actions": sum(line["actions"] for line in lines),
-        **{name: dict(counter) for name, counter in counts.items()},
-        "per_episode": lines,
-    }
+    return scoring.evaluate(
+        build.build_policy(config), params, build.observer(config), seeds=seeds, parallel=config.eval.parallel,
+        threads=config.data.threads, seed=config.seed, progress=told,
+    )[0]  # fmt: skip
 
 
 def row_of(summary: Mapping[str, Any]) -> dict[str, Any]:
@@ -195,9 +164,12 @@ def with_interval(value: float, interval: Sequence[float | None], *, signed: boo
     return form.format(value) + ("" if math.isnan(low) else f" [{form.format(low)}, {form.format(high)}]")
 
 
-def counted(counts: Mapping[str, int]) -> str:
-    """Write the counts that are not 0, the largest first: `3 wrong yaw, 1 missed pick`."""
-    return ", ".join(f"{n} {name}" for name, n in sorted(counts.items(), key=lambda item: -item[1]) if n)
+def cells(row: Mapping[str, Any], against: str = "") -> list[str]:
+    """Write a row's label, score and complete rate, and where `against` names it the field that compares it with the first row."""
+    found = [row["label"], with_interval(row["score"], row["interval95"]), f"{row['complete_percent']:.0f}%"]
+    if against:
+        found.append(with_interval(row[against]["mean"], row[against]["interval95"], signed=True) if against in row else "")
+    return found
 
 
 def table(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:

@@ -9,7 +9,6 @@ training stopped.
 
 from __future__ import annotations
 
-import functools
 import pathlib
 from collections.abc import Sequence
 from typing import Any
@@ -17,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from experiments import common
-from lala_jax import build, options, train
+from lala_jax import build, options
 
 FLAGS = {"task": "tower", "demos": "500,50,10", "seeds": "0,1,2", "split": "test", "start": 0, "episodes": 100, "out": ""}
 
@@ -26,19 +25,23 @@ def main(config, workdir, *, task: str, demos: str, seeds: str, split: str, star
     """Train a task's config for each number of demonstrations and seed, and score on the test split."""
     base = options.override(config, [f"eval.split={split}", f"eval.start={start}", f"eval.episodes={episodes}"])
     scored = build.split_seeds(split, start, episodes)
-    jobs = []
-    for row in plan(common.numbers("--demos", demos), common.numbers("--seeds", seeds)):
-        directory = f"{build.workdir(config, workdir)}-{row.name}"
-        job = functools.partial(run, row.configs(base)[0], directory)
-        jobs.append(common.Job(row.name, row.label, common.identity(row, base, scored, weights=None), job))
+    rows, runs = plan(numbers("--demos", demos), numbers("--seeds", seeds)), build.workdir(config, workdir)
 
     def finish(done: Sequence[dict[str, Any]]) -> dict[str, Any]:
         return {"task": task, "split": split, "means": means(done)}
 
     path = pathlib.Path(out or f"experiments/results/{task}") / "main.json"
-    done = common.fill(path, jobs, finish)
+    done = common.fill(path, rows, lambda row: run(row, base, runs), finish, config=base, seeds=scored)
     print(f"\n{table(done)}\n\n{path}")
     return done
+
+
+def numbers(name: str, text: str) -> list[int]:
+    """Read a flag of comma-separated whole numbers."""
+    try:
+        return [int(part) for part in text.split(",")]
+    except ValueError:
+        raise options.OptionsError(f"{name} must be whole numbers like 500,50,10, got {text!r}") from None
 
 
 def plan(demos: Sequence[int], seeds: Sequence[int]) -> list[common.Row]:
@@ -47,11 +50,11 @@ def plan(demos: Sequence[int], seeds: Sequence[int]) -> list[common.Row]:
     return [common.Row(f"{n}-{seed}", f"{n} demonstrations, seed {seed}", (f"data.demos={n}", f"seed={seed}")) for n, seed in pairs]
 
 
-def run(config, directory: str) -> dict[str, Any]:
+def run(row: common.Row, base, runs: str) -> dict[str, Any]:
     """Train one run and score it."""
-    summary = train.train_and_evaluate(config, directory)
-    seconds = common.train_seconds(pathlib.Path(directory))
-    return {**common.row_of(summary), "demos": config.data.demos, "train_seed": config.seed, "train_seconds": seconds}
+    config = row.configs(base)[0]
+    fields = common.train_and_score(config, pathlib.Path(f"{runs}-{row.name}"))
+    return {**fields, "demos": config.data.demos, "train_seed": config.seed}
 
 
 def means(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -77,15 +80,7 @@ def means(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
     """Write the runs, and the means where there are several seeds, as a Markdown table."""
-    lines = [
-        [
-            row["label"],
-            common.with_interval(row["score"], row["interval95"]),
-            f"{row['complete_percent']:.0f}%",
-            f"{row['train_seconds']:.0f}",
-        ]
-        for row in rows
-    ]
+    lines = [[*common.cells(row), f"{row['train_seconds']:.0f}"] for row in rows]
     for mean in means(rows):
         if mean["deviation"] is not None:
             label = f"{mean['demos']} demonstrations, mean of {len(mean['train_seeds'])} seeds"

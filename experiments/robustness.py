@@ -8,16 +8,16 @@ missing; `--rows=moved,noise` runs only these.
 
 from __future__ import annotations
 
-import functools
+import collections
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
 import numpy as np
 
 from experiments import common
-from lala_jax import build, evaluate, options
+from lala_jax import build, evaluate, options, publish, rollout
 from lala_jax.sim import oracle
 from lala_jax.sim.tasks import base
 
@@ -32,7 +32,7 @@ ROWS = (
     common.Row("distractors", "two objects that the goal does not show", ("task.distractors=2",)),
     *(common.Row(f"tower-{n}", f"towers of {n}", (f"task.num_objects={n}",), tasks=("tower",)) for n in (3, 4, 6)),
 )
-PUBLISHED = ("episodes", "score", "interval95", "complete_percent")
+COUNTS = ("actions_by_cause", "first_failures", "lost_objects", "failures_by_reason")  # of a summary
 FLAGS = {"checkpoint": "", "split": "test", "start": 0, "episodes": 100, "rows": "", "out": ""}
 
 
@@ -40,32 +40,41 @@ def main(config, workdir, *, checkpoint: str, split: str, start: int, episodes: 
     """Score a checkpoint in the worlds of `ROWS`."""
     del workdir
     name, seeds = config.task.name, build.split_seeds(split, start, episodes)
-    params, weights = common.load_weights(checkpoint, config, build.build_policy(config))
+    params, weights = common.load_weights(checkpoint, config)
     chosen = common.choose(ROWS, rows, name)
     paired = {row.name: same_scenes(config, row.configs(config)[0], seeds) for row in chosen}
-    jobs = [
-        common.Job(
-            row.name, row.label, common.identity(row, config, seeds, weights=weights), functools.partial(run, row, config, params, seeds)
-        )
-        for row in chosen
-    ]
 
     def finish(done: Sequence[dict[str, Any]]) -> dict[str, Any]:
         for row in done[1:]:
             row["drop"] = common.difference(done[0]["scores"], row["scores"], paired=paired[row["name"]])
-        conditions = {row["label"]: {field: row[field] for field in PUBLISHED} for row in done}
+        conditions = {row["label"]: {field: row[field] for field in publish.SCORE} for row in done}
         return {"task": name, "split": split, "checkpoint": checkpoint, "reference": done[0]["name"], "conditions": conditions}
 
     path = pathlib.Path(out or f"experiments/results/{name}") / f"robustness-{split}.json"
-    done = common.fill(path, jobs, finish)
+    done = common.fill(path, chosen, lambda row: run(row, config, params, seeds), finish, config=config, seeds=seeds, weights=weights)
     print(f"\n{table(done)}\n\n{path}")
     return done
 
 
 def run(row: common.Row, config, params, seeds: Sequence[int]) -> dict[str, Any]:
     """Score one row: each part on its share of the seeds."""
-    parts = zip(row.configs(config), common.shares(seeds, len(row.parts)), strict=False)  # fewer seeds than parts: the first parts
-    return common.row_of(common.merged([common.score(one, params, share) for one, share in parts]))
+    parts = zip(row.configs(config), shares(seeds, len(row.parts)), strict=False)  # fewer seeds than parts: the first parts
+    return common.row_of(merged([common.score(one, params, share) for one, share in parts]))
+
+
+def shares(seeds: Sequence[int], count: int) -> list[list[int]]:
+    """Deal seeds in order to `count` parts as equal as can be."""
+    return [part.tolist() for part in np.array_split(np.asarray(seeds), count) if part.size]
+
+
+def merged(summaries: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Give the summary of all episodes from those of parts."""
+    lines = [line for summary in summaries for line in summary["per_episode"]]
+    counts = {name: collections.Counter() for name in COUNTS}
+    for name, counter in counts.items():
+        for summary in summaries:
+            counter.update(summary[name])
+    return {**rollout.head(lines), **{name: dict(counter) for name, counter in counts.items()}, "per_episode": lines}
 
 
 def same_scenes(config, other, seeds: Sequence[int]) -> bool:
@@ -73,8 +82,8 @@ def same_scenes(config, other, seeds: Sequence[int]) -> bool:
     tasks = build.task(config), build.task(other)
     if tasks[0] == tasks[1]:
         return True
-    same = [_same(*(_wanted(task, seed) for task in tasks)) for seed in seeds]  # every scene is drawn, also after one that differs
-    return all(same)
+    pairs = [[_wanted(task, seed) for task in tasks] for seed in seeds]  # every scene is drawn, also after one that differs
+    return all(jax.tree.all(jax.tree.map(np.array_equal, *pair)) for pair in pairs)
 
 
 def _wanted(task: base.Task, seed: int):
@@ -83,23 +92,15 @@ def _wanted(task: base.Task, seed: int):
     return scene.base, [leaf[kept] for leaf in (scene.size, scene.color, scene.start, scene.goal)]
 
 
-def _same(one, other) -> bool:
-    return all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True))
-
-
 def table(rows: Sequence[dict[str, Any]]) -> str:
     """Write the rows as a Markdown table."""
-    lines = [
-        [
-            row["label"],
-            common.with_interval(row["score"], row["interval95"]),
-            f"{row['complete_percent']:.0f}%",
-            common.with_interval(row["drop"]["mean"], row["drop"]["interval95"], signed=True) if "drop" in row else "",
-            common.counted(row["first_failures"]),
-        ]
-        for row in rows
-    ]
+    lines = [[*common.cells(row, "drop"), counted(row["first_failures"])] for row in rows]
     return common.table(["world", "score", "complete", "drop", "first to go wrong, episodes"], lines)
+
+
+def counted(counts: Mapping[str, int]) -> str:
+    """Write the counts that are not 0, the largest first: `3 wrong yaw, 1 missed pick`."""
+    return ", ".join(f"{n} {name}" for name, n in sorted(counts.items(), key=lambda item: -item[1]) if n)
 
 
 def command(argv: Sequence[str] | None = None):

@@ -11,6 +11,8 @@ import jax.numpy as jnp
 from lala_jax import types
 from lala_jax.perception import noise, transforms
 
+CANDIDATES = 64  # colours drawn uniformly, out of which those of the objects are chosen
+
 
 @dataclasses.dataclass(frozen=True)
 class Sensors:
@@ -49,25 +51,21 @@ def recolor(
     state: types.State,
     *,
     palette: jax.Array,
+    apart: float,
     jitter: float = 0.04,
     mix: float = 0.5,
-    apart: float | None = None,
-    candidates: int = 64,
 ) -> types.State:
     """Give the objects new colours, the same in scene and goal since both are drawn from `state.color`.
 
     Colours are drawn from `palette` `[P, 3]` without replacement (P >= N); with probability `mix` uniformly in RGB instead, each
-    `apart` (None: as the closest two of the palette) from the others; every colour gets normal noise of `jitter`.
+    `apart` from the others; every colour gets normal noise of `jitter`.
     """
     count = state.color.shape[0]
     if count > palette.shape[0]:
         raise ValueError(f"{count} objects cannot be recoloured from a palette of {palette.shape[0]} colours")
     key_order, key_any, key_jitter, key_coin = jax.random.split(key, 4)
-    if apart is None:
-        distance = jnp.linalg.norm(palette[:, None] - palette, axis=-1)
-        apart = jnp.where(jnp.eye(len(palette), dtype=bool), jnp.inf, distance).min()
     known = jax.random.permutation(key_order, palette)[:count]
-    unseen = spread(jax.random.uniform(key_any, (candidates, 3)), count, apart=apart)
+    unseen = spread(jax.random.uniform(key_any, (CANDIDATES, 3)), count, apart=apart)
     color = jnp.where(jax.random.bernoulli(key_coin, mix), unseen, known)
     color += jitter * jax.random.normal(key_jitter, color.shape)
     return state.replace(color=jnp.clip(color, 0.0, 1.0))

@@ -121,8 +121,7 @@ def recipe(config: Mapping[str, Any]) -> train_step.Recipe:
 def run_settings(config: Mapping[str, Any]) -> dict[str, Any]:
     """List the fields that make a run what it is, by dotted name: all but those that say how often to report and where data lie."""
     free = ("eval.", "data.directory", "data.threads", "train.log_every", "train.save_every", "train.eval_every", "train.eval_episodes")
-    flat = {f"{group}.{name}": value for group, fields in config.items() if group != "seed" for name, value in fields.items()}
-    return {"seed": config["seed"]} | {name: value for name, value in flat.items() if not name.startswith(free)}
+    return {name: value for name, value in options.fields(config).items() if not name.startswith(free)}
 
 
 def input_spec(config: Mapping[str, Any]) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from typing import Any
 
 from lala_jax import build, options, pretrained, scoring, writers
 
+FLAGS = {"checkpoint": "", "agent": "policy", "split": "", "start": -1, "episodes": 0}
 NO_CHECKPOINT = "give --checkpoint=PATH, or --config=FILE.py with --agent=oracle or --agent=blind"
 
 
@@ -27,7 +28,7 @@ def main(config, workdir, *, checkpoint: str, agent: str, split: str, start: int
         built, observer = build.build_policy(config), build.observer(config)
         params = scoring.check_checkpoint(checkpoint, config, built)
         result, strips = scoring.evaluate(
-            built, params, observer, seeds=seeds, parallel=min(config.eval.parallel, len(seeds)), threads=threads,
+            built, params, observer, seeds=seeds, parallel=config.eval.parallel, threads=threads,
             strips=config.eval.strips, seed=config.seed, progress=lambda done, total: print(f"{done} of {total} episodes", flush=True),
         )  # fmt: skip
     else:
@@ -67,7 +68,7 @@ def stored_config(flags: Mapping[str, Any]):
 if __name__ == "__main__":
     options.run(
         main,
-        flags={"checkpoint": "", "agent": "policy", "split": "", "start": -1, "episodes": 0},
+        flags=FLAGS,
         config_from=stored_config,
         workdir=build.WORKDIR + "/eval",
         user_errors=build.USER_ERRORS,

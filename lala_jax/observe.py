@@ -22,9 +22,8 @@ BASELINE = 0.055  # metres between the two imagers of a RealSense D415
 class Rig:
     """The cameras of E episodes where they are not the preset's, leaves `[E, V, ...]`."""
 
-    camera: types.Camera  # where they are
     believed: types.Camera  # where they are thought to be
-    background: types.Views | None  # what they see of what never moves, None where they have not moved
+    background: types.Views | None  # what they see of what never moves, from where they are; None where they have not moved
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,15 +100,15 @@ class Observer:
     def mount(self, key: jax.Array, size: jax.Array, color: jax.Array, base: jax.Array, poses: jax.Array) -> Rig:
         """Put up the cameras of E episodes: move them, and calibrate them on the pictures of the first `poses` `[E, N, 7]`."""
         key_move, key_noise = jax.random.split(key)
-        count, camera = size.shape[0], self.camera
-        keys = jax.random.split(key_move, count)
-        camera = jax.vmap(lambda k: noise.move_cameras(k, camera, shift=self.shift, turn=math.radians(self.turn)))(keys)
+        count, nominal = size.shape[0], self.camera
         model, data = scene.geom_template(self.task)
         static = scene.static_geoms(model)
         layer = None
         if self.shift or self.turn:
+            keys = jax.random.split(key_move, count)
+            camera = jax.vmap(lambda k: noise.move_cameras(k, nominal, shift=self.shift, turn=math.radians(self.turn)))(keys)
             layer = jax.lax.map(lambda one: render.background(model, data, one, geoms=static, segmentation=False), camera)
-        believed = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), self.camera)
+        believed = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), nominal)
         if self.calibrate:
             views = self.look(size, color, base, poses, key=key_noise, layer=layer)
 
@@ -117,7 +116,7 @@ class Observer:
                 return distance.distance(model, data, points, geoms=static)
 
             believed = jax.lax.map(lambda one: calibration.calibrate(one[0], one[1], measure), (views.depth, believed))
-        return Rig(camera, believed, layer)
+        return Rig(believed, layer)
 
     def check(self) -> None:
         """Raise ValueError naming the first camera of the preset that sees nothing of the table or the arm."""

@@ -165,12 +165,18 @@ def _execute(path: pathlib.Path) -> Any:
     return module
 
 
-def _fields(config: ml_collections.ConfigDict, prefix: str = "") -> dict[str, Any]:
-    """List every leaf by its dotted name."""
+def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[str]:
+    """List the entries of two flat mappings that are not the same."""
+    changed = [name for name in sorted({**there, **here}) if there.get(name) != here.get(name)]
+    return [f"{name} ({there.get(name)!r} there, {here.get(name)!r} here)" for name in changed]
+
+
+def fields(config: Mapping[str, Any] | ml_collections.ConfigDict, prefix: str = "") -> dict[str, Any]:
+    """List every leaf of a config or of nested dicts by its dotted name."""
     found = {}
     for key in config:
-        if isinstance(config[key], ml_collections.ConfigDict):
-            found |= _fields(config[key], f"{prefix}{key}.")
+        if isinstance(config[key], (ml_collections.ConfigDict, Mapping)):
+            found |= fields(config[key], f"{prefix}{key}.")
         else:
             found[prefix + key] = config[key]
     return found
@@ -186,7 +192,7 @@ def _assign(config: ml_collections.ConfigDict, name: str, text: str) -> None:
         if part not in group:
             prefix = "".join(f"{above}." for above in parts[:depth])
             siblings = [prefix + key for key in group]
-            elsewhere = [field for field in _fields(config) if field.split(".")[-1] == parts[-1]]
+            elsewhere = [field for field in fields(config) if field.split(".")[-1] == parts[-1]]
             hint = _suggest(prefix + part, siblings, elsewhere)
             raise OptionsError(f"unknown config field {name}{hint}\n" + _wrap(f"fields of {at}: {', '.join(siblings)}"))
         parent, group = group, group[part]
@@ -301,7 +307,7 @@ def _usage(program: str, main: Callable[..., Any], flags: dict[str, Any], config
     lines += [inspect.getdoc(main) or ""]
     lines += [f"  --{name}={default!r}" for name, default in flags.items()]
     if config is not None:
-        lines += [f"  --config.{name}={value!r}" for name, value in _fields(load(config)).items()]
+        lines += [f"  --config.{name}={value!r}" for name, value in fields(load(config)).items()]
     return "\n".join(line for line in lines if line)
 
 

@@ -154,30 +154,30 @@ class GoalAwarePolicy:
         sample = draw(key_draw, state, spec=spec, rotations=model.rotations, candidates=candidates, multi_action=self.multi_action)
         match, layout = self._look(variables, current, goal)
         target = model.apply(variables, match, sample.pick, method="target")
-        place = model.apply(variables, layout, target, sample.pick, method="place")
+        place = self._place(variables, layout, target, sample.pick)
         terms = {
             "pick": losses.masked_cross_entropy(match.pick, sample.pick_best),
-            "place": losses.place_cross_entropy(place.logits, sample.bins, sample.cells, sample.valid),
+            "place": losses.place_cross_entropy(place, sample.bins, sample.cells, sample.valid),
         }
+        more = {}
         if self._matches:
-            terms["match"], terms["next"], match_right = self._match_losses(key_match, state, match)
+            terms["match"], terms["next"], more["match_right"] = self._match_losses(key_match, state, match)
         if self.refine:
             terms["refine"], terms["fit"], refined = self._refine_losses(variables, key_refine, state, match, layout)
+            more |= refined
         total = terms["pick"] + terms["place"] + self.match_weight * (terms.get("match", 0.0) + terms.get("next", 0.0))
         total += self.refine_weight * (terms.get("refine", 0.0) + terms.get("fit", 0.0))
-        metrics = {f"loss_{name}": value for name, value in terms.items()} | {"loss": total}
-        metrics |= hits(sample, match.pick, place.logits, spec=spec, rotations=model.rotations)
-        if self._matches:
-            metrics["match_right"] = match_right
-        if self.refine:
-            metrics |= refined
-        return total, metrics
+        metrics = {f"loss_{name}": value for name, value in terms.items()} | {"loss": total} | more
+        return total, metrics | hits(sample, match.pick, place, spec=spec, rotations=model.rotations)
 
     def _look(self, variables, current, goal):
         if self.max_height:
             current, goal = topdown.keep_highest(current), topdown.keep_highest(goal)
         apply = self.model.apply
         return apply(variables, current, goal, method="match"), apply(variables, current, goal, method="layout")
+
+    def _place(self, variables, layout, target, pick) -> jax.Array:
+        return jnp.asarray(self.model.apply(variables, layout, target, pick, method="place"))
 
     def _match_losses(self, key, state, match):
         """Match every unplaced object with its voxels in the goal, and tell the voxels that may be built next."""
@@ -277,11 +277,11 @@ class GoalAwarePolicy:
             pick_logits = (pick_logits + turned.pick[::-1, ::-1]) / 2
         pick = jnp.stack(argmax_index(pick_logits))
         target = model.apply(variables, match, pick, method="target")
-        place_logits = model.apply(variables, layout, target, pick, method="place").logits
+        place_logits = self._place(variables, layout, target, pick)
         if self.average_turns:
             there = jnp.array([spec.rows - 1, spec.cols - 1]) - pick
             target_there = model.apply(variables, turned, there, method="target")
-            place_there = model.apply(variables, turned_layout, target_there, there, method="place").logits
+            place_there = self._place(variables, turned_layout, target_there, there)
             place_logits = (place_logits + place_there[:, ::-1, ::-1]) / 2
         cells, turns = self._guesses(place_logits)
         cell, turn = cells[0] + 0.5, turns[0].astype(jnp.float32)

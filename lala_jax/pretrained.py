@@ -22,7 +22,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from lala_jax import checkpoint
+from lala_jax import checkpoint, options
 
 FORMAT_VERSION = 1
 WEIGHTS = pathlib.Path(__file__).resolve().parent / "weights"
@@ -30,7 +30,7 @@ PREFIX = "pretrained"
 CARD, ARRAYS = "card.json", "weights.npz"
 FIELDS = ("sha256", "dtype", "step", "config", "input_spec", "scores")  # of the card, read here
 STORED = {"float32": np.float32, "bfloat16": np.uint16}  # dtype of the parameters to that of the arrays
-COMPARED = ("task", "camera", "map", "model")  # groups of the config that a score belongs to, beside the seed
+COMPARED = ("seed", "task", "camera", "map", "model")  # groups of the config that a score belongs to
 
 
 def names() -> list[str]:
@@ -133,12 +133,7 @@ def _read_arrays(file: pathlib.Path, found: Mapping[str, Any]) -> dict[str, Any]
 
 def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[str]:
     """List the fields that decide a score and are not the same in two configs (as JSON holds them)."""
-    flat = [
-        {"seed": config["seed"]} | {f"{group}.{name}": value for group in COMPARED for name, value in config[group].items()}
-        for config in (there, here)
-    ]
-    changed = [name for name in sorted(flat[0] | flat[1]) if flat[0].get(name) != flat[1].get(name)]
-    return [f"{name} ({flat[0].get(name)!r} there, {flat[1].get(name)!r} here)" for name in changed]
+    return options.differences(*(options.fields({group: config[group] for group in COMPARED}) for config in (there, here)))
 
 
 def verdict(

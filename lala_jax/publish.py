@@ -1,6 +1,6 @@
 """Turn a checkpoint and its scores into weights that ship with the package.
 
-    python -m lala_jax.publish --checkpoint=runs/tower/checkpoints --scores=experiments/results/tower/scores-policy-test.json \\
+    python -m lala_jax.publish --checkpoint=runs/tower-500-0/checkpoints --scores=experiments/results/tower/scores-policy-test.json \\
         --out=lala_jax/weights/tower
 
 Several score files are separated by commas; `lala_jax.evaluate --checkpoint=pretrained/tower` repeats the first. `--dtype=bfloat16` halves
@@ -150,13 +150,9 @@ def _selection(config: Mapping[str, Any]) -> str:
 def training_command(config: Mapping[str, Any]) -> str:
     """Compose the command that trains what `config` (as JSON holds it) describes: its task's config file and what differs from it."""
     file = f"configs/{config['task']['name']}.py"
-    given, usual = (
-        build.run_settings(fields)
-        | {f"train.{name}": fields["train"][name] for name in ("eval_every", "eval_episodes")}  # they choose the best checkpoint
-        | {"data.directory": fields["data"]["directory"]}
-        for fields in (config, writers.plain(options.to_dict(options.load(file))))
-    )
-    changed = {name: value for name, value in given.items() if name not in usual or usual[name] != value}
+    free = ("eval.", "data.threads", "train.log_every", "train.save_every")
+    given, usual = (options.fields(one) for one in (config, writers.plain(options.to_dict(options.load(file)))))
+    changed = {n: value for n, value in given.items() if not n.startswith(free) and (n not in usual or usual[n] != value)}
     if os.path.isabs(changed.get("data.directory", "")):  # where demonstrations lie on this machine
         del changed["data.directory"]
     flags = [shlex.quote(f"--config.{name}={tuple(value) if isinstance(value, list) else value}") for name, value in changed.items()]
@@ -169,16 +165,15 @@ def _evaluation_command(out: pathlib.Path) -> str:
 
 
 def _robustness(file: str, task: str, source: str) -> dict[str, Any]:
-    """Read the scores in other worlds: a mapping, or its field `conditions`, from the world to its scores."""
+    """Read the scores in other worlds that `experiments.robustness` writes."""
     found = _read_json(file)
     try:
-        if found.get("task", task) != task or not _same_place(found.get("checkpoint", source), source):
-            there = f"{found.get('task', task)}, {found.get('checkpoint', source)}"
-            raise options.OptionsError(f"{file} holds scores of {there}, not of {task}, {source}")
-        rows = [{"condition": name, **_row(row, (), file)} for name, row in found.get("conditions", found).items()]
+        if found["task"] != task or not _same_place(found["checkpoint"], source):
+            raise options.OptionsError(f"{file} holds scores of {found['task']}, {found['checkpoint']}, not of {task}, {source}")
+        rows = [{"condition": name, **_row(row, (), file)} for name, row in found["conditions"].items()]
+        return {"file": file, "split": found["split"], "conditions": rows}
     except (KeyError, TypeError, AttributeError) as error:
         raise options.OptionsError(f"{file} is no table of conditions: {type(error).__name__} {error}") from error
-    return {"file": file, "split": found.get("split"), "conditions": rows}
 
 
 def _row(found: Mapping[str, Any], more: Sequence[str], file: str) -> dict[str, Any]:
@@ -259,11 +254,10 @@ def _other_worlds(table: Mapping[str, Any] | None) -> list[str]:
     """Write the paragraphs on robustness."""
     if table is None:
         return []
-    split = f", {table['split']} split" if table["split"] else ""
     rows = [f"| {row['condition']} | {row['episodes']} | {_score(row)} |" for row in table["conditions"]]
     return [
         "## Other worlds",
-        f"The same weights where something is not as in training (`{table['file']}`{split}).",
+        f"The same weights where something is not as in training (`{table['file']}`, {table['split']} split).",
         "\n".join(["| world | episodes | score | complete |", "|---|---|---|---|", *rows]),
     ]
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import collections
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -145,6 +146,19 @@ def half_width(values: Sequence[float] | np.ndarray) -> float:
     return 1.96 * float(np.std(values, ddof=1)) / math.sqrt(len(values)) if len(values) > 1 else math.nan
 
 
+def head(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Sum up the lines of episodes (a summary's `per_episode`): mean score with a 95% interval, complete rate, number of actions."""
+    scores = np.array([line["score"] for line in lines])
+    mean, half = float(scores.mean()), half_width(scores)
+    return {
+        "episodes": len(lines),
+        "score": mean,
+        "interval95": [max(mean - half, 0.0), min(mean + half, 100.0)],
+        "complete_percent": 100.0 * float(np.mean([line["complete"] for line in lines])),
+        "actions": sum(line["actions"] for line in lines),
+    }
+
+
 def first_failure(causes: Sequence[str]) -> str:
     """Give the first of an episode's `causes` that is not "right", "none" where there is none."""
     return next((cause for cause in causes if cause != "right"), "none")
@@ -173,23 +187,16 @@ def summary(episodes: Sequence[Episode]) -> dict:
     `first_failures` counts the incomplete episodes by what first went wrong (`first_failure`), `lost_objects` the objects that are not
     where they belong by what last happened to each (`lost_objects`), `failures_by_reason` the actions that could not be carried out.
     """
-    scores = np.array([episode.score for episode in episodes])
-    half = half_width(scores)
+    lines = [{"seed": e.seed, "score": e.score, "complete": e.complete, "actions": len(e.actions), "causes": e.causes} for e in episodes]
     causes = collections.Counter(cause for episode in episodes for cause in episode.causes)
     first = collections.Counter(first_failure(episode.causes) for episode in episodes if not episode.complete)
     lost = collections.Counter(cause for episode in episodes for cause in lost_objects(episode))
     reasons = collections.Counter(outcome.reason for episode in episodes for outcome in episode.outcomes if not outcome.ok)
     return {
-        "episodes": len(episodes),
-        "score": float(scores.mean()),
-        "interval95": [float(max(scores.mean() - half, 0.0)), float(min(scores.mean() + half, 100.0))],
-        "complete_percent": 100.0 * float(np.mean([episode.complete for episode in episodes])),
-        "actions": int(sum(len(episode.actions) for episode in episodes)),
+        **head(lines),
         "actions_by_cause": {cause: causes[cause] for cause in CAUSES},
         "first_failures": {cause: first[cause] for cause in (*CAUSES[1:], "none")},
         "lost_objects": {cause: lost[cause] for cause in (*CAUSES, "never moved")},
         "failures_by_reason": dict(reasons),
-        "per_episode": [
-            {"seed": e.seed, "score": e.score, "complete": e.complete, "actions": len(e.actions), "causes": e.causes} for e in episodes
-        ],
+        "per_episode": lines,
     }

@@ -87,7 +87,7 @@ def evaluate(
     The first `strips` episodes are drawn, as `("episode", 0)` and so on, and, where any are, the first `FAILURES` that score below 100,
     as `("failure", 0)` and so on.
     """
-    task, episodes, drawn, failed = observer.task, [], {}, 0
+    task, parallel, episodes, drawn, failed = observer.task, min(parallel, len(seeds)), [], {}, 0
     for start in range(0, len(seeds), parallel):
         chunk = list(seeds[start : start + parallel])
         scenes = [task.sample(s) for s in chunk]
@@ -168,7 +168,7 @@ def _check_shapes(path, params, template) -> None:
 
 def write_scores(config, result, strips, out: pathlib.Path, *, agent: str, split: str, seeds: Sequence[int], source: str | None) -> None:
     """Write `scores-<agent>-<split>.json` and the pictures to `out`, and print the line that matters."""
-    for (kind, number), picture in dict(strips).items():
+    for (kind, number), picture in strips.items():
         writers.write_image(out / f"{kind}-{split}-{number}.webp", picture)
     path = out / f"scores-{agent}-{split}.json"
     facts = {"agent": agent, "task": config.task.name, "split": split, "seeds": [seeds[0], seeds[-1]], "checkpoint": source}

@@ -52,10 +52,7 @@ def start_or_resume(config: Mapping[str, Any], recipe: train_step.Recipe, store:
         return fresh
     there = build.run_settings(checkpoint.describe(store.directory / "latest" / str(found[0]))["config"])
     here = build.run_settings(writers.plain(options.to_dict(config)))
-    changed = [
-        f"{name} ({there.get(name)} there, {here.get(name)} here)" for name in sorted(there | here) if there.get(name) != here.get(name)
-    ]
-    if changed:
+    if changed := options.differences(there, here):
         raise checkpoint.CheckpointError(f"{store.directory} holds a run with another {', '.join(changed)}: choose another --workdir")
     return found[1]
 
@@ -138,7 +135,7 @@ def _validate(config, recipe, run, store, stored, writer) -> None:
     """Score the averaged parameters on val episodes set apart for this and keep them if they are the best."""
     seeds = build.split_seeds("val", build.SELECTION_START, config.train.eval_episodes)
     result, _ = scoring.evaluate(
-        recipe.policy, run.average, recipe.observer, seeds=seeds, parallel=min(config.eval.parallel, len(seeds)),
+        recipe.policy, run.average, recipe.observer, seeds=seeds, parallel=config.eval.parallel,
         threads=config.data.threads,
     )  # fmt: skip
     store.save_best(int(run.step), run, result["score"], **stored)
@@ -149,9 +146,8 @@ def final_scores(config, recipe, params, out: pathlib.Path) -> dict[str, Any]:
     """Score the best checkpoint on the config's split, and write the scores and the pictures."""
     fields = config.eval
     seeds = build.split_seeds(fields.split, fields.start, fields.episodes)
-    parallel = min(fields.parallel, len(seeds))
     result, strips = scoring.evaluate(
-        recipe.policy, params, recipe.observer, seeds=seeds, parallel=parallel, threads=config.data.threads, strips=fields.strips
+        recipe.policy, params, recipe.observer, seeds=seeds, parallel=fields.parallel, threads=config.data.threads, strips=fields.strips
     )
     scoring.write_scores(config, result, strips, out, agent="policy", split=fields.split, seeds=seeds, source=str(out / "checkpoints"))
     return result

@@ -38,7 +38,8 @@ def augmented(recipe: Recipe, key: jax.Array, example: types.State) -> types.Sta
     """Recolour and move one example, scene and goal alike. Unbatched."""
     key_color, key_rigid = jax.random.split(key)
     if recipe.recolor:
-        example = augment.recolor(key_color, example, palette=jnp.asarray(palette(recipe.observer.task)))
+        colors = palette(recipe.observer.task)
+        example = augment.recolor(key_color, example, palette=jnp.asarray(colors), apart=base.closest(colors))
     if recipe.rigid:
         radius = float(np.linalg.norm(recipe.observer.task.base_size[:2])) / 2
         example = augment.rigid(key_rigid, example, spec=recipe.observer.spec, base_radius=radius)

@@ -2,8 +2,11 @@
 
 import os
 import pathlib
+import runpy
 import sys
 import tempfile
+import types
+import warnings
 
 import jaxtyping
 import pytest
@@ -18,6 +21,25 @@ os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # several test 
 
 # From here on, every call into perception checks the shapes and types that the signature states.
 jaxtyping.install_import_hook("lala_jax.perception", "beartype.beartype")
+
+
+@pytest.fixture
+def call(monkeypatch, capsys):
+    """Run `python -m module arguments` in this process: its `status`, and what it wrote to `out` and `err`."""
+
+    def run(module, *arguments):
+        monkeypatch.setattr(sys, "argv", [module, *map(str, arguments)])
+        status = 0
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", ".*found in sys.modules", RuntimeWarning)
+            try:
+                runpy.run_module(module, run_name="__main__", alter_sys=True)
+            except SystemExit as error:
+                status = error.code
+        said = capsys.readouterr()
+        return types.SimpleNamespace(status=status, out=said.out, err=said.err)
+
+    return run
 
 
 def pytest_addoption(parser):

@@ -5,11 +5,11 @@ Training runs as a process of its own; what follows runs each module's `__main__
 
 import json
 import pathlib
-import runpy
+import re
 import shutil
 import subprocess
 import sys
-import typing
+import types
 
 import numpy as np
 import pytest
@@ -20,30 +20,6 @@ from lala_jax import dataset
 ROOT = pathlib.Path(__file__).parent.parent
 SMALL = ("data.demos=2", "train.log_every=1", "train.save_every=1", "train.eval_every=2", "train.eval_episodes=1")
 SMALL += ("eval.episodes=1", "eval.parallel=1", "eval.strips=1")
-
-pytestmark = pytest.mark.filterwarnings("ignore:.*found in sys.modules:RuntimeWarning")
-
-
-class Answer(typing.NamedTuple):
-    status: int
-    out: str
-    err: str
-
-
-@pytest.fixture
-def call(monkeypatch, capsys):
-    """Run `python -m module arguments` in this process."""
-
-    def run(module, *arguments):
-        monkeypatch.setattr(sys, "argv", [module, *map(str, arguments)])
-        status = 0
-        try:
-            runpy.run_module(module, run_name="__main__", alter_sys=True)
-        except SystemExit as error:
-            status = error.code
-        return Answer(status, *capsys.readouterr())
-
-    return run
 
 
 def tiny(directory, *more, config="configs/tower.py:smoke"):
@@ -133,7 +109,7 @@ def refused(answer, *messages):
     assert answer.status == 2, answer
     assert "Traceback" not in answer.err and len(answer.err.splitlines()) <= 24
     for message in messages:
-        assert pytest.RaisesExc(SystemExit, match=message).matches(SystemExit(answer.err)), answer.err
+        assert re.search(message, answer.err), answer.err
 
 
 @pytest.mark.parametrize(
@@ -161,9 +137,8 @@ def test_a_process_ends_with_status_2(tmp_path):
     """The whole way out, once: what a shell sees."""
     command = [sys.executable, "-m", "lala_jax.collect", "--config=configs/towr.py"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    refused(
-        Answer(done.returncode, done.stdout, done.stderr), r"lala_jax.collect: no config file configs/towr.py", "did you mean .*tower.py"
-    )
+    answer = types.SimpleNamespace(status=done.returncode, err=done.stderr)
+    refused(answer, r"lala_jax.collect: no config file configs/towr.py", "did you mean .*tower.py")
 
 
 @pytest.mark.parametrize(

@@ -53,7 +53,7 @@ def test_rows_are_chosen_by_name():
     with pytest.raises(options.OptionsError, match="--rows must be one of 'nominal', .*got 'nois'; did you mean noise"):
         common.choose(robustness.ROWS, "nois", "pallet")
     with pytest.raises(options.OptionsError, match="--seeds must be whole numbers like 500,50,10, got '0,one'"):
-        common.numbers("--seeds", "0,one")
+        main_table.numbers("--seeds", "0,one")
     recoveries = next(row for row in ablation.ROWS if row.name == "recoveries").configs(shipped("pallet"))[0]
     assert recoveries.data.directory == "data/pallet-mistakes"
 
@@ -61,25 +61,18 @@ def test_rows_are_chosen_by_name():
 # Rows that are kept
 
 
-def row_like(name, score=50.0, **more):
-    return {"score": score, "interval95": [score, score], "complete_percent": 0.0, "scores": {"1": score}, **more}
-
-
 def filled(path, config, *rows, weights=None, fails=()):
     """Fill a file with rows of changes to `config`: what was run, and the rows."""
     ran = []
 
-    def job(row):
-        def work():
-            if row.name in fails:
-                raise KeyboardInterrupt
-            ran.append(row.name)
-            return row_like(row.name)
-
-        return common.Job(row.name, row.label, common.identity(row, config, SEEDS, weights=weights), work)
+    def work(row):
+        if row.name in fails:
+            raise KeyboardInterrupt
+        ran.append(row.name)
+        return {"score": 50.0}
 
     try:
-        done = common.fill(path, [job(row) for row in rows], lambda rows: {"count": len(rows)})
+        done = common.fill(path, rows, work, lambda rows: {"count": len(rows)}, config=config, seeds=SEEDS, weights=weights)
     except KeyboardInterrupt:
         done = None
     return ran, done
@@ -139,8 +132,8 @@ def test_intervals_of_differences():
 
 
 def test_quarters_are_dealt_in_order():
-    assert common.shares(list(range(10)), 4) == [[0, 1, 2], [3, 4, 5], [6, 7], [8, 9]]
-    assert common.shares([7, 9], 4) == [[7], [9]]
+    assert robustness.shares(list(range(10)), 4) == [[0, 1, 2], [3, 4, 5], [6, 7], [8, 9]]
+    assert robustness.shares([7, 9], 4) == [[7], [9]]
 
 
 def test_merged_quarters_equal_one_summary():
@@ -148,9 +141,9 @@ def test_merged_quarters_equal_one_summary():
     episodes = run(task, [0, 2]) + run(task, [4], constant(None))
     scenes = [task.sample(6)]
     episodes += rollout.run(task, scenes, [6], rollout.oracle_agent(task, scenes, [6], blind=True), threads=1)
-    parts = [[episodes[i] for i in share] for share in common.shares(range(4), 3)]
-    assert common.merged([rollout.summary(part) for part in parts]) == rollout.summary(episodes)
-    assert common.merged([rollout.summary(episodes)]) == rollout.summary(episodes)
+    parts = [[episodes[i] for i in share] for share in robustness.shares(range(4), 3)]
+    assert robustness.merged([rollout.summary(part) for part in parts]) == rollout.summary(episodes)
+    assert robustness.merged([rollout.summary(episodes)]) == rollout.summary(episodes)
     row = common.row_of(rollout.summary(episodes))
     assert row["scores"]["4"] == 0 and list(row["scores"]) == ["0", "2", "4", "6"] and "per_episode" not in row
 
@@ -173,7 +166,7 @@ def test_tables():
     text = common.table(["", "score"], [["a", common.with_interval(50, [40.04, 60])], ["b", common.with_interval(1, [None, None])]])
     assert text.splitlines() == ["|  | score |", "| --- | --- |", "| a | 50.0 [40.0, 60.0] |", "| b | 1.0 |"]
     assert common.with_interval(-2, [-3, 1], signed=True) == "-2.0 [-3.0, +1.0]"
-    assert common.counted({"wrong yaw": 1, "wrong place": 3, "none": 0}) == "3 wrong place, 1 wrong yaw"
+    assert robustness.counted({"wrong yaw": 1, "wrong place": 3, "none": 0}) == "3 wrong place, 1 wrong yaw"
 
 
 # Whole series
@@ -197,9 +190,7 @@ def trains(monkeypatch):
 
 def told(seeds, score):
     lines = [{"seed": s, "score": score + s % 4, "complete": False, "actions": 1, "causes": ["wrong yaw"]} for s in seeds]
-    counts = {name: {"wrong yaw": len(seeds)} for name in common.COUNTS}
-    scores = [line["score"] for line in lines]
-    return common.merged([{"per_episode": lines, "score": np.mean(scores), **counts}])
+    return robustness.merged([{"per_episode": lines, **{name: {"wrong yaw": len(seeds)} for name in robustness.COUNTS}}])
 
 
 def test_the_ablation_trains_each_row_once(trains, monkeypatch, tmp_path, capsys):

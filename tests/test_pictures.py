@@ -3,10 +3,11 @@
 import math
 import types as python_types
 
+import jax
 import numpy as np
 import pytest
 
-from lala_jax import pictures, report, types
+from lala_jax import pictures, policy, report, types
 
 SPEC = types.MapSpec(cell=0.0125, slices=7)  # 80 x 40 cells of 4 cm slices
 RED, BLUE = (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)
@@ -18,9 +19,8 @@ def views(count=4, height=24, width=32, color=RED):
 
 
 def empty_map(channels=3):
-    shape = (SPEC.rows, SPEC.cols, SPEC.slices)
-    sizes = {"features": (*shape, channels), "count": shape, "offset": (*shape, 2), "height": shape[:2], "skin": (*shape[:2], 2)}
-    return types.TopDownMap(**{name: np.zeros(size, np.float32) for name, size in sizes.items()})
+    """A map in which nothing was seen, to be written to."""
+    return jax.tree.map(np.array, policy.empty_map(SPEC, features=channels))
 
 
 def action(pick=(0.4, -0.2, 0.04), place=(0.6, 0.3, 0.1), yaw=0.5):

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from test_scoring import drawn_params
 
 from lala_jax import policy, types
 from lala_jax.models import goal_aware, transporter
@@ -190,7 +191,6 @@ class Canned:
     refine: collections.abc.Callable  # of pick, cell and turn: offset [3] and fit
     spec: types.MapSpec = SPEC
     rotations: int = ROTATIONS
-    matching: bool = True
     pick: tuple = (30, 12)
 
     def apply(self, variables, *inputs, method):
@@ -202,7 +202,7 @@ class Canned:
             logits = jnp.zeros((self.rotations, SPEC.rows, SPEC.cols))
             for at, value in self.place:
                 logits = logits.at[at].set(value)
-            return goal_aware.Place(logits=logits)
+            return logits
         return self.refine(*inputs[2:]) if method == "refine" else None
 
 
@@ -320,7 +320,7 @@ class Looking(Canned):
         if method == "place":
             (now, goal), shown, pick = inputs
             seen = shown + jnp.roll(now.height, 2 * pick, (0, 1))
-            return goal_aware.Place(logits=jnp.stack([jnp.roll(goal.height, k, 0) + jnp.roll(seen, k, 1) for k in range(self.rotations)]))
+            return jnp.stack([jnp.roll(goal.height, k, 0) + jnp.roll(seen, k, 1) for k in range(self.rotations)])
         return super().apply(variables, *inputs, method=method)
 
 
@@ -388,13 +388,6 @@ def batch_of(*examples):
     return keys, *jax.tree.map(lambda *leaves: jnp.stack(leaves), *examples)
 
 
-def drawn_params(agent):
-    """Parameters of the size that `init` gives, drawn by numpy: `init` alone takes longer to compile than all the rest."""
-    rng = np.random.default_rng(0)
-    shapes = jax.eval_shape(agent.init, jax.random.key(0))
-    return jax.tree.map(lambda s: jnp.asarray(rng.normal(0, math.prod(s.shape[:-1]) ** -0.5, s.shape), jnp.float32), shapes)
-
-
 @pytest.mark.parametrize("name", list(POLICIES)[1:])
 def test_transporters_lose_finitely_and_act_on_the_map(name):
     """In one program, for its compilation is what this costs."""
@@ -412,6 +405,11 @@ def test_transporters_lose_finitely_and_act_on_the_map(name):
     assert 0.3 < float(metrics["loss_place"]) / math.log(ROTATIONS * 80 * 40) < 1.5
     for index in range(2):
         check_action(agent, *jax.tree.map(lambda leaf, index=index: leaf[index], (actions, heats, batch[2])))
+
+
+def means(metrics):
+    """The mean of every metric over some steps."""
+    return {name: float(np.mean([one[name] for one in metrics])) for name in metrics[0]}
 
 
 def test_goal_aware_learns_a_batch_by_heart():
@@ -437,15 +435,15 @@ def test_goal_aware_learns_a_batch_by_heart():
     seen = []
     for number in range(201):
         params, opt_state, metrics, size = step(params, opt_state, keys[number % 4], *batch)
-        seen = [*seen, metrics]
+        seen.append(metrics)
         if number == 20:
             dead = [jax.tree_util.keystr(path) for path, leaf in jax.tree.leaves_with_path(size) if not leaf > 0]
             assert not dead, f"no gradient reaches {dead}"
         if number % 20 == 19:
-            recent = {name: float(np.mean([one[name] for one in seen[-4:]])) for name in metrics}
+            recent = means(seen[-4:])
             if max(recent["loss_pick"], recent["loss_place"], recent["loss_refine"]) < 0.1:
                 break
-    metrics, first = ({name: float(np.mean([one[name] for one in those])) for name in metrics} for those in (seen[-4:], seen[:4]))
+    metrics, first = means(seen[-4:]), means(seen[:4])
     assert metrics["loss_pick"] < 0.3 and metrics["loss_place"] < 0.3, metrics
     assert all(metrics[name] < 0.7 * first[name] for name in ("loss_match", "loss_next", "loss_refine", "loss_fit")), metrics
     assert metrics["pick_right"] == metrics["place_right"] == metrics["fit_right"] == 1

@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_scoring import SINGLE, drawn_params
+from test_cli import contents, refused
+from test_scoring import SINGLE, save
 from test_train_step import tiny_config
 
 from lala_jax import build, checkpoint, evaluate, options, pretrained, publish, scoring, writers
@@ -28,9 +29,7 @@ def bits(tree):
 
 def scored(config, path, workdir, **flags):
     """Evaluate through the function that the command calls; flags that are not given are the command's."""
-    return evaluate.main(
-        config, str(workdir), checkpoint=str(path), **{"agent": "policy", "split": "", "start": -1, "episodes": 0, **flags}
-    )
+    return evaluate.main(config, str(workdir), **{**evaluate.FLAGS, "checkpoint": str(path), **flags})
 
 
 @pytest.fixture(scope="module")
@@ -38,9 +37,7 @@ def run(tmp_path_factory):
     """A checkpoint of a policy that can do nothing and its scores on two test episodes: `(checkpoint, file of scores, parameters)`."""
     path = tmp_path_factory.mktemp("run")
     config = tiny()
-    params = drawn_params(build.build_policy(config))
-    stored = {"config": options.to_dict(config), "input_spec": build.input_spec(config)}
-    checkpoint.Checkpoints(path / "checkpoints").save_best(7, {"average": params}, 50.0, **stored)
+    params = save(path / "checkpoints", config, step=7)
     scored(config, path / "checkpoints", path / "eval", split="test", start=1, episodes=2)
     return path / "checkpoints", path / "eval" / "scores-policy-test.json", params
 
@@ -80,10 +77,10 @@ def test_bfloat16_comes_back_rounded_once(run, published, tmp_path):
 
 def test_publishing_again_gives_the_same_files(run, published):
     """Also from the published weights themselves, with scores of theirs."""
-    before = {path.name: path.read_bytes() for path in published.iterdir()}
+    before = contents(published)
     assert set(before) == {"weights.npz", "card.json", "README.md"}
     publish.publish(str(run[0]), [str(run[1])], published)
-    assert {path.name: path.read_bytes() for path in published.iterdir()} == before
+    assert contents(published) == before
     scored(options.from_dict(pretrained.describe(published)["config"]), published, published.parent / "eval")
     publish.publish(str(published), [str(published.parent / "eval" / "scores-policy-test.json")], published)
     assert (published / "weights.npz").read_bytes() == before["weights.npz"]
@@ -257,7 +254,7 @@ def test_what_is_not_published_weights_is_left_alone(run, tmp_path):
 
 
 def test_a_failed_write_leaves_what_was_there(run, published, monkeypatch):
-    before = {path.name: path.read_bytes() for path in published.iterdir()}
+    before = contents(published)
     real = publish.os.replace
 
     def fail(source, target):
@@ -268,7 +265,7 @@ def test_a_failed_write_leaves_what_was_there(run, published, monkeypatch):
     monkeypatch.setattr(publish.os, "replace", fail)
     with pytest.raises(OSError, match="full"):
         publish.publish(str(run[0]), [str(run[1])], published, dtype="bfloat16")
-    assert {path.name: path.read_bytes() for path in published.iterdir()} == before
+    assert contents(published) == before
     assert [path.name for path in published.parent.iterdir()] == ["tiny"]
 
 
@@ -287,20 +284,19 @@ ROW = {"score": 81.25, "interval95": [70.0, 92.5], "complete_percent": 40.0, "ep
 
 def test_other_worlds_are_tabled(run, tmp_path):
     file = tmp_path / "robustness.json"
-    for more in ({}, {"task": "tower", "split": "test", "checkpoint": str(run[0]), "rows": []}):
-        rows = {"one camera missing": {**ROW, "per_episode": []}}
-        file.write_text(json.dumps({**more, "conditions": rows} if more else rows))
-        card = publish.publish(str(run[0]), [str(run[1])], tmp_path / "out", robustness=str(file))
-        stored = {"file": str(file), "split": more.get("split"), "conditions": [{"condition": "one camera missing", **ROW}]}
-        assert card["robustness"] == stored and pretrained.card(tmp_path / "out") == card
-        assert "| one camera missing | 50 | 81.2 [70.0, 92.5] | 40% |" in (tmp_path / "out" / "README.md").read_text()
+    rows = {"one camera missing": {**ROW, "per_episode": []}}
+    file.write_text(json.dumps({"task": "tower", "split": "test", "checkpoint": str(run[0]), "rows": [], "conditions": rows}))
+    card = publish.publish(str(run[0]), [str(run[1])], tmp_path / "out", robustness=str(file))
+    stored = {"file": str(file), "split": "test", "conditions": [{"condition": "one camera missing", **ROW}]}
+    assert card["robustness"] == stored and pretrained.card(tmp_path / "out") == card
+    assert "| one camera missing | 50 | 81.2 [70.0, 92.5] | 40% |" in (tmp_path / "out" / "README.md").read_text()
 
 
 @pytest.mark.parametrize(
     ("table", "message"),
     [
-        ({"task": "pallet", "conditions": {}}, "holds scores of pallet, .*, not of tower"),
-        ({"checkpoint": "runs/other/checkpoints", "conditions": {}}, "holds scores of tower, runs/other/checkpoints, not of tower"),
+        ({"task": "pallet", "checkpoint": "", "conditions": {}}, "holds scores of pallet, .*, not of tower"),
+        ({"task": "tower", "checkpoint": "runs/other", "conditions": {}}, "holds scores of tower, runs/other, not of tower"),
         ({"dark": {}}, "is no table of conditions"),
         ([], "is no table of conditions"),
     ],
@@ -311,18 +307,9 @@ def test_wrong_tables_are_refused(run, tmp_path, table, message):
         publish.publish(str(run[0]), [str(run[1])], tmp_path / "out", robustness=str(tmp_path / "robustness.json"))
 
 
-def command(*arguments):
-    """What `python -m lala_jax.publish` does."""
-    flags = {"checkpoint": "", "scores": "", "out": "", "dtype": "float32", "robustness": ""}
-    options.run(
-        publish.main, flags=flags, config_from=publish.stored_config, workdir="unused", user_errors=build.USER_ERRORS, argv=arguments
-    )
-
-
-def test_the_command(run, tmp_path, capsys):
+def test_the_command(run, tmp_path, call):
     given = [f"--checkpoint={run[0]}", f"--scores={run[1]}", f"--out={tmp_path / 'out'}"]
-    command(*given)
-    said = capsys.readouterr().out
+    said = call("lala_jax.publish", *given).out
     assert "parameters, float32, 0." in said and f"python -m lala_jax.evaluate --checkpoint={tmp_path / 'out'}" in said
     for arguments, message in [
         (given[:2], "give --out=PATH"),
@@ -331,10 +318,7 @@ def test_the_command(run, tmp_path, capsys):
         ([f"--checkpoint={tmp_path}", *given[1:]], "no checkpoint at"),
         ([given[0], f"--scores={tmp_path}/none.json", given[2]], "cannot read .*none.json"),
     ]:
-        with pytest.raises(SystemExit) as caught:
-            command(*arguments)
-        assert caught.value.code == 2
-        assert pytest.RaisesExc(SystemExit, match=message).matches(SystemExit(capsys.readouterr().err))
+        refused(call("lala_jax.publish", *arguments), message)
 
 
 def test_the_weights_in_the_package_are_whole():

@@ -15,9 +15,9 @@ SINGLE = ("model.name=single", "model.stages=1", "model.multi_action=false")
 SEEDS = [1, 3, 5]
 
 
-def drawn_params(agent, seed=0):
-    """Parameters drawn by numpy: what is scored here need not be good, and `init` is slow to compile."""
-    rng = np.random.default_rng(seed)
+def drawn_params(agent):
+    """Parameters of the size that `init` gives, drawn by numpy: they need not be good, and `init` is slow to compile."""
+    rng = np.random.default_rng(0)
     shapes = jax.eval_shape(agent.init, jax.random.key(0))
     return jax.tree.map(lambda s: jnp.asarray(rng.normal(0, np.prod(s.shape[:-1]) ** -0.5, s.shape), jnp.float32), shapes)
 
@@ -102,7 +102,7 @@ def test_episodes_are_drawn_as_their_own_cameras_saw_them(built, changes):
         patch.setattr(pictures, "episode_strip", lambda panels, final, goal, caption: seen.append((len(panels), goal)))
         scoring.episode_pictures(actor, {1: episode})
     count, goal = seen[0]
-    camera = observer.camera if actor.rig is None else jax.tree.map(lambda leaf: leaf[1], actor.rig.camera)
+    camera = observer.camera if actor.rig is None else jax.tree.map(lambda leaf: leaf[1], actor.rig.background.camera)
     model, data = scene.geom_template(observer.task)
     told = scenes[1]
     full = render.render(*scene.place(model, data, size=told.size, color=told.color, poses=told.goal, base=told.base), camera)
@@ -121,11 +121,11 @@ def test_scores_and_pictures_are_written(alone, tmp_path, capsys):
     assert f"score {summary['score']:.1f}" in capsys.readouterr().out
 
 
-def save(path, config):
+def save(path, config, step=1):
     """A checkpoint of a fresh policy of `config`, as training leaves it."""
     params = drawn_params(build.build_policy(config))
     stored = {"config": options.to_dict(config), "input_spec": build.input_spec(config)}
-    checkpoint.Checkpoints(path).save_best(1, {"average": params}, 50.0, **stored)
+    checkpoint.Checkpoints(path).save_best(step, {"average": params}, 50.0, **stored)
     return params
 
 
@@ -144,19 +144,13 @@ def test_a_checkpoint_comes_back(tmp_path):
         ("model.name=two_stream", r"is of another model: key_net/current/\S+ is None there, \(.*\) in the config"),
         ("map.cell=0.025", r"expects the input .*'rows': 80.*, the config makes .*'rows': 40"),
         ("map.slices=7", r"expects the input .*'slices': 14.*, the config makes .*'slices': 7"),
+        ("model.channels=5", r"key_net/.*/expand/kernel is \(1, 1, 4, 2\) there, \(1, 1, 4, 5\) in the config"),
     ],
 )
 def test_a_checkpoint_of_another_model_is_refused(tmp_path, change, message):
     save(tmp_path, tiny_config(*SINGLE))
     other = tiny_config(*SINGLE, change)
     with pytest.raises(checkpoint.MismatchError, match=message):
-        scoring.check_checkpoint(str(tmp_path), other, build.build_policy(other))
-
-
-def test_the_shapes_of_the_first_leaf_that_differs_are_named(tmp_path):
-    save(tmp_path, tiny_config(*SINGLE))
-    other = tiny_config(*SINGLE, "model.channels=5")
-    with pytest.raises(checkpoint.MismatchError, match=r"key_net/.*/expand/kernel is \(1, 1, 4, 2\) there, \(1, 1, 4, 5\) in the config"):
         scoring.check_checkpoint(str(tmp_path), other, build.build_policy(other))
 
 

@@ -96,9 +96,7 @@ def test_a_scene_and_its_goal_are_seen_with_the_same_errors():
     now, goal = jax.device_get(see(jax.random.key(0)))
     jax.tree.map(np.testing.assert_array_equal, now, goal)
     assert np.abs(now.height[0] - now.height[1]).max() > 1e-3
-    again, other = (see(jax.random.key(seed))[0] for seed in (0, 1))
-    np.testing.assert_array_equal(again.height, now.height)
-    assert np.abs(other.height - now.height).max() > 1e-3
+    assert np.abs(see(jax.random.key(1))[0].height - now.height).max() > 1e-3
 
 
 def test_metrics_are_named_and_finite():

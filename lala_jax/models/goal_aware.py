@@ -48,13 +48,6 @@ class Match:
 
 
 @struct.dataclass
-class Place:
-    """What one pick gives: logits over k rotations of every cell."""
-
-    logits: jax.Array  # [k, rows, cols]
-
-
-@struct.dataclass
 class Layout:
     """What the place step and the refinement read of both maps, whatever is picked."""
 
@@ -225,8 +218,8 @@ class GoalAware(nn.Module):
         on_map = jnp.ones((self.spec.rows, self.spec.cols, 1))
         return Layout(now=jnp.concatenate([_surface_input(current), on_map], axis=-1), goal=surface, levels=levels)
 
-    def place(self, layout: Layout, target: Target, pick: jax.Array) -> Place:
-        """Say where the object under the cell `pick` `[2]` (row, col) goes, for every rotation and cell."""
+    def place(self, layout: Layout, target: Target, pick: jax.Array) -> jax.Array:
+        """Say where the object under the cell `pick` `[2]` (row, col) goes: logits `[k, rows, cols]` over rotations and cells."""
         around, centre = self._around(layout, pick)
         crops = image.rotate_crop(around, centre, self.rotations, self.crop)
         turns = jnp.arange(self.rotations) * (2 * math.pi / self.rotations)
@@ -234,7 +227,7 @@ class GoalAware(nn.Module):
         key = self.key_net(self._picture(layout.goal, layout.levels, weight, target))
         kernels = self.query_net(_turn_offsets(crops, turns[:, None, None]))
         scale = (self.crop * self.crop * self.channels) ** -0.5
-        return Place(logits=correlation.correlate(key[..., :-1], kernels * scale) + key[None, ..., -1])
+        return correlation.correlate(key[..., :-1], kernels * scale) + key[None, ..., -1]
 
     def target(self, match: Match, pick: jax.Array) -> Target:
         """Find the object under the cell `pick` `[2]` in the goal.
@@ -288,7 +281,7 @@ class GoalAware(nn.Module):
         return jnp.concatenate([goal, fine.max(-1)[..., None], (fine * height).max(-1)[..., None], mean, level[..., 6:], face], axis=-1)
 
     def __call__(self, current: types.TopDownMap, goal: types.TopDownMap, pick: jax.Array):
-        """Run every part once (to make the parameters): `(Match, Place, (offset, fit))`."""
+        """Run every part once (to make the parameters): `(Match, place logits, (offset, fit))`."""
         match = self.match(current, goal)
         layout = self.layout(current, goal)
         target = self.target(match, pick)
@@ -346,9 +339,7 @@ def _surface_input(topdown_map):
 
 def _window(values, rows, cols):
     """Read the cells of some rows `[r]` and columns `[c]` of `[rows, cols, ...]`, zero outside: `[r, c, ...]`."""
-    inside = ((rows >= 0) & (rows < values.shape[0]))[:, None] & ((cols >= 0) & (cols < values.shape[1]))[None]
-    read = values[jnp.clip(rows, 0, values.shape[0] - 1)[:, None], jnp.clip(cols, 0, values.shape[1] - 1)[None]]
-    return jnp.where(inside.reshape(inside.shape + (1,) * (values.ndim - 2)), read, 0.0)
+    return values.at[rows[:, None], cols].get(mode="fill", fill_value=0, wrap_negative_indices=False)
 
 
 def _turn_offsets(crops, yaw):

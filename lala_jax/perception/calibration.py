@@ -7,16 +7,23 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from lala_jax import types
 from lala_jax.perception import camera as pinhole
 from lala_jax.perception import transforms
 
+STRIDE = 8  # pixels between those that the first two stages look at
 BLOCK = 4  # pixels a side: the last stage looks at whole blocks around known surfaces other than the table
+BLOCKS = 256  # of them, at most
+ITERATIONS = (5, 8, 5)  # of the three stages
+SCALE = (0.15, 0.01)  # metres: a residual that counts half (in the loss), first and last
+PRIOR = (1e-4, 1e-6)  # weight of staying at the nominal pose, before the last stage and in it
 NEAR = 0.03  # metres: such a block's middle is at most this far from its surface once the coarse stage is done
 MAX_BALANCE = 30.0  # so often a point off the table counts at most in the coarse stage
 ON_TABLE = 1e-5  # metres
+NO_TURN = np.array([1.0, 0.0, 0.0, 0.0], np.float32)  # a quaternion
 
 
 def calibrate(
@@ -24,11 +31,6 @@ def calibrate(
     camera: types.Camera,
     distance: Callable[[jax.Array], jax.Array],
     *,
-    stride: int = 8,
-    blocks: int = 256,
-    iterations: tuple[int, int, int] = (5, 8, 5),
-    scale: tuple[float, float] = (0.15, 0.01),
-    prior: tuple[float, float] = (1e-4, 1e-6),
     limit: tuple[float, float] = (0.08, math.radians(8.0)),
 ) -> types.Camera:
     """Give V cameras the poses from which they see what is known where it is; intrinsics stay. Each view on its own, no reference image.
@@ -39,42 +41,38 @@ def calibrate(
 
     Robust Gauss-Newton on the pose: the residual is a point's distance to the nearest known surface (Chen and Medioni, Object
     modelling by registration of multiple range images, IVC 1992; from a distance function as in Fitzgibbon, Robust registration
-    of 2D and 3D point sets, IVC 2003), weighted by Geman and McClure's function whose scale shrinks from `scale[0]` to
-    `scale[1]` metres (Zhou, Park and Koltun, Fast global registration, ECCV 2016), which leaves objects out. Three stages of
-    `iterations` each: (level) the table alone sets height, roll and pitch, without which its points would be taken for the
-    arm's; (coarse) every known surface on each `stride`-th pixel, those other than the table weighted up to the table's share;
-    (fine) the same pixels and up to `blocks` blocks of 4 x 4 pixels near surfaces other than the table, all points alike.
+    of 2D and 3D point sets, IVC 2003), weighted by Geman and McClure's function whose scale shrinks from `SCALE[0]` to
+    `SCALE[1]` metres (Zhou, Park and Koltun, Fast global registration, ECCV 2016), which leaves objects out. Three stages of
+    `ITERATIONS` each: (level) the table alone sets height, roll and pitch, without which its points would be taken for the
+    arm's; (coarse) every known surface on each `STRIDE`-th pixel, those other than the table weighted up to the table's share;
+    (fine) the same pixels and up to `BLOCKS` blocks of 4 x 4 pixels near surfaces other than the table, all points alike.
 
     Shift of the eye (metres) and turn about the eye (radians) from the nominal pose, both in world axes, are held by a weak
-    `prior` (up to the fine stage, in it) in units of the weighted mean square residual: at 1e-6, 3 cm cost as much as a root
+    `PRIOR` (up to the fine stage, in it) in units of the weighted mean square residual: at 1e-6, 3 cm cost as much as a root
     mean square of 0.03 mm. So a camera stays nominal in what its image does not say: one that sees only the table keeps x, y
     and the turn about the vertical exactly, one that sees nothing keeps all. A pose farther than `limit` (metres, radians) from
     the nominal one is not believed, and the view keeps its nominal pose. In scenes of both tasks 1080 of 1080
     views that were moved by up to 3 cm and 3 degrees were found, 113 of 120 that were moved by 5 cm and 5 degrees.
     """
-    if depth.shape != (camera.intrinsics.shape[0], camera.height, camera.width):
-        size = (camera.intrinsics.shape[0], camera.height, camera.width)
+    size = (camera.intrinsics.shape[0], camera.height, camera.width)
+    if depth.shape != size:
         raise ValueError(f"calibrate needs depth of its cameras' shape {size}, got {depth.shape}; vmap over scenes")
 
     def one(depth, camera):
-        shift, quat = _find(depth, camera, distance, stride, blocks, iterations, scale, prior)
+        shift, quat = _find(depth, camera, distance)
         believed = (jnp.linalg.norm(shift) <= limit[0]) & (2 * jnp.arccos(jnp.minimum(jnp.abs(quat[0]), 1.0)) <= limit[1])
-        shift = jnp.where(believed, shift, 0.0)
-        turn = jnp.where(believed, transforms.matrix_from_quat(quat), jnp.eye(3))
-        pose = camera.world_from_cam
-        rotation = jnp.matmul(turn, pose[:3, :3], precision=jax.lax.Precision.HIGHEST)
-        return camera.replace(world_from_cam=pose.at[:3, :3].set(rotation).at[:3, 3].add(shift))
+        return pinhole.moved(camera, jnp.where(believed, shift, 0.0), jnp.where(believed, quat, NO_TURN))
 
     return jax.vmap(one)(depth, camera)
 
 
-def _find(depth, camera, distance, stride, blocks, iterations, scale, prior):
+def _find(depth, camera, distance):
     """Give the shift of the eye `[3]` and the turn about it `[4]`, in world axes, that one view says."""
     eye = camera.world_from_cam[:3, 3]
     arms = pinhole.directions(camera) * depth[..., None]  # [H, W, 3] from the eye to the point, in world axes; 0: not seen
-    middle = stride // 2
-    sparse = arms[middle::stride, middle::stride].reshape(-1, 3)
-    level, coarse, fine = iterations
+    middle = STRIDE // 2
+    sparse = arms[middle::STRIDE, middle::STRIDE].reshape(-1, 3)
+    level, coarse, fine = ITERATIONS
 
     def solve(pose, arms, scales, *, prior, others):
         def iterate(pose, scale):
@@ -82,15 +80,15 @@ def _find(depth, camera, distance, stride, blocks, iterations, scale, prior):
 
         return jax.lax.scan(iterate, pose, scales)[0]
 
-    pose = jnp.zeros(3), jnp.array([1.0, 0.0, 0.0, 0.0])
-    pose = solve(pose, sparse, _shrink(scale, level), prior=prior[0], others="left out")
-    pose = solve(pose, sparse, _shrink(scale, coarse), prior=prior[0], others="balanced")
-    points = jnp.concatenate([sparse, _blocks_off_table(pose, arms, eye, distance, blocks)])
-    return solve(pose, points, jnp.full(fine, scale[1]), prior=prior[1], others="alike")
+    pose = jnp.zeros(3), jnp.asarray(NO_TURN)
+    pose = solve(pose, sparse, _shrink(level), prior=PRIOR[0], others="left out")
+    pose = solve(pose, sparse, _shrink(coarse), prior=PRIOR[0], others="balanced")
+    points = jnp.concatenate([sparse, _blocks_off_table(pose, arms, eye, distance)])
+    return solve(pose, points, jnp.full(fine, SCALE[1]), prior=PRIOR[1], others="alike")
 
 
-def _shrink(scale, steps):
-    first, last = scale
+def _shrink(steps):
+    first, last = SCALE
     return jnp.asarray([first * (last / first) ** (i / max(steps - 1, 1)) for i in range(steps)], jnp.float32)
 
 
@@ -128,8 +126,8 @@ def _reach(pose, arms, eye):
     return turned, turned + (eye + shift)
 
 
-def _blocks_off_table(pose, arms, eye, distance, blocks):
-    """Pick up to `blocks` blocks of `arms` `[H, W, 3]` near known surfaces other than the table, evenly spread; `[blocks * 16, 3]`."""
+def _blocks_off_table(pose, arms, eye, distance):
+    """Pick up to `BLOCKS` blocks of `arms` `[H, W, 3]` near known surfaces other than the table, evenly spread; `[BLOCKS * 16, 3]`."""
     rows, cols = arms.shape[0] // BLOCK, arms.shape[1] // BLOCK
     tiles = arms[: rows * BLOCK, : cols * BLOCK].reshape(rows, BLOCK, cols, BLOCK, 3).swapaxes(1, 2).reshape(rows * cols, BLOCK**2, 3)
     middle = tiles[:, BLOCK * (BLOCK // 2) + BLOCK // 2]
@@ -138,6 +136,6 @@ def _blocks_off_table(pose, arms, eye, distance, blocks):
     near = (middle != 0).any(-1) & (jnp.abs(gap) < NEAR) & (jnp.abs(gap - points[:, 2]) >= ON_TABLE)
     rank = jnp.cumsum(near)
     count = rank[-1]
-    spread = jnp.ceil((jnp.arange(blocks) + 0.5) * count / blocks).astype(rank.dtype)
-    index = jnp.searchsorted(rank, jnp.where(count > blocks, spread, jnp.arange(blocks) + 1))  # past the end where there are fewer
+    spread = jnp.ceil((jnp.arange(BLOCKS) + 0.5) * count / BLOCKS).astype(rank.dtype)
+    index = jnp.searchsorted(rank, jnp.where(count > BLOCKS, spread, jnp.arange(BLOCKS) + 1))  # past the end where there are fewer
     return tiles.at[index].get(mode="fill", fill_value=0).reshape(-1, 3)

@@ -20,6 +20,13 @@ def intrinsics(height: int, width: int, *, focal: float) -> Float[Array, "3 3"]:
     return jnp.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]], jnp.float32)
 
 
+def moved(camera: types.Camera, shift: jax.Array, quat: jax.Array) -> types.Camera:
+    """Shift cameras (leaves `[...]`) by `shift` `[..., 3]` metres and turn them about themselves by `quat` `[..., 4]`, in world axes."""
+    pose = camera.world_from_cam
+    rotation = jnp.matmul(transforms.matrix_from_quat(quat), pose[..., :3, :3], precision=jax.lax.Precision.HIGHEST)
+    return camera.replace(world_from_cam=pose.at[..., :3, :3].set(rotation).at[..., :3, 3].add(shift))
+
+
 def look_at(eye: transforms.Vectors, target: transforms.Vectors, up: transforms.Vectors = (0.0, 0.0, 1.0)) -> transforms.Matrices:
     """Give `world_from_cam` `[..., 4, 4]` of a camera at `eye` that looks at `target` with `up` upwards in the image.
 

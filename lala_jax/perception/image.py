@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Num
 
+from lala_jax.perception import transforms
+
 
 def sample(image: Float[Array, "rows cols c"], at: Float[Array, "... 2"]) -> Float[Array, "... c"]:
     """Read an image bilinearly at continuous `(row, col)` `[..., 2]` (the centre of `[i, j]` is `(i + 0.5, j + 0.5)`), zero outside."""
@@ -29,25 +31,23 @@ def sample(image: Float[Array, "rows cols c"], at: Float[Array, "... 2"]) -> Flo
     return out
 
 
-def rotation_offsets(yaw_bins: int, size: int) -> np.ndarray:
-    """Give `[k, size, size, 2]` offsets `(row, col)` in cells at which each rotated crop reads, relative to its centre.
+def rotation_offsets(yaw, size: int):
+    """Give `[..., size, size, 2]` offsets `(row, col)` in cells at which a crop turned by each `yaw` `[...]` reads, relative to its centre.
 
-    Crop `b` shows the content turned by `+2 pi b / k` about world z (row runs along +y, col along +x), so it reads at
-    the inverse turn of its own offset; the turning point is the centre of crop cell `[size // 2, size // 2]`.
+    The crop shows the content turned by `yaw` radians about world z (row runs along +y, col along +x), so it reads at the
+    inverse turn of its own offset; the turning point is the centre of crop cell `[size // 2, size // 2]`. NumPy in, NumPy out.
     """
-    theta = (2 * math.pi / yaw_bins * np.arange(yaw_bins))[:, None, None]
+    xp, yaw = transforms.to_arrays(yaw)
     y, x = np.meshgrid(np.arange(size) - size // 2, np.arange(size) - size // 2, indexing="ij")
-    cos, sin = np.cos(theta), np.sin(theta)
-    return np.stack([cos * y - sin * x, cos * x + sin * y], axis=-1)
+    cos, sin = xp.cos(yaw)[..., None, None], xp.sin(yaw)[..., None, None]
+    return xp.stack([cos * y - sin * x, cos * x + sin * y], axis=-1)
 
 
 def turned_crop(
     image: Float[Array, "rows cols c"], center: Num[Array | np.ndarray, " 2"] | Sequence, yaw: Float[Array, ""], size: int
 ) -> Float[Array, "size size c"]:
     """Give one crop of `rotate_crop`, for any `yaw` in radians."""
-    y, x = np.meshgrid(np.arange(size) - size // 2, np.arange(size) - size // 2, indexing="ij")
-    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
-    return sample(image, jnp.stack([cos * y - sin * x, cos * x + sin * y], axis=-1) + jnp.asarray(center, jnp.float32))
+    return sample(image, rotation_offsets(yaw, size) + jnp.asarray(center, jnp.float32))
 
 
 def rotate_crop(
@@ -59,6 +59,6 @@ def rotate_crop(
     The centre lands on the centre of crop cell `[size // 2, size // 2]`: give `(i + 0.5, j + 0.5)` to turn about
     cell `[i, j]`. Bilinear, zero outside the image.
     """
-    offsets = jnp.asarray(rotation_offsets(yaw_bins, size), jnp.float32)
+    offsets = jnp.asarray(rotation_offsets(2 * math.pi / yaw_bins * np.arange(yaw_bins), size), jnp.float32)
     center = jnp.broadcast_to(jnp.asarray(center, jnp.float32), offsets.shape)
     return sample(image, center + offsets)

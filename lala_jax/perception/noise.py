@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from lala_jax import types
-from lala_jax.perception import transforms
+from lala_jax.perception import camera as pinhole
 
 
 def depth_noise(
@@ -53,9 +53,7 @@ def move_cameras(key: jax.Array, camera: types.Camera, *, shift: float, turn: fl
     step = _directions(key_shift, count) * length[0] * shift
     half = length[1] * turn / 2
     quat = jnp.concatenate([jnp.cos(half), jnp.sin(half) * _directions(key_axis, count)], axis=-1)
-    rotation = jnp.matmul(transforms.matrix_from_quat(quat), camera.world_from_cam[:, :3, :3], precision=jax.lax.Precision.HIGHEST)
-    moved = camera.world_from_cam.at[:, :3, :3].set(rotation).at[:, :3, 3].add(step)
-    return camera.replace(world_from_cam=moved)
+    return pinhole.moved(camera, step, quat)
 
 
 def _directions(key, count):

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 
+from lala_jax.sim import render_shapes
 from lala_jax.sim.quiet import mjx
 
 TINY = 1e-24  # square metres under a root, so that its gradient stays finite
-
-PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
-SPHERE = int(mujoco.mjtGeom.mjGEOM_SPHERE)
-CAPSULE = int(mujoco.mjtGeom.mjGEOM_CAPSULE)
-CYLINDER = int(mujoco.mjtGeom.mjGEOM_CYLINDER)
-BOX = int(mujoco.mjtGeom.mjGEOM_BOX)
 
 
 def distance(model: mjx.Model, data: mjx.Data, points: jax.Array, *, geoms: tuple[int, ...]) -> jax.Array:
@@ -28,27 +24,10 @@ def distance(model: mjx.Model, data: mjx.Data, points: jax.Array, *, geoms: tupl
     """
     if points.ndim != 2 or points.shape[-1] != 3:
         raise ValueError(f"distance is unbatched: points must be [P, 3], got {points.shape}; vmap over clouds")
-    nearest = [_nearest(kind, model, data, np.asarray(ids), points) for kind, ids in _groups(model, geoms)]
-    result = nearest[0]
-    for other in nearest[1:]:
-        result = jnp.minimum(result, other)
-    return result
-
-
-def _groups(model, geoms):
-    """Sort the geoms by type: a list of (kind, ids)."""
-    kinds = np.asarray(model.geom_type)
     if not geoms:
         raise ValueError("distance needs at least one geom")
-    for geom in geoms:
-        if not 0 <= geom < len(kinds):
-            raise ValueError(f"geom {geom} is not in the model, which has {len(kinds)}")
-        if int(kinds[geom]) not in _DISTANCES:
-            name = mujoco.mjtGeom(int(kinds[geom])).name.removeprefix("mjGEOM_").lower()
-            known = ", ".join(mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower() for kind in _DISTANCES)
-            raise ValueError(f"geom {geom} is of type {name}, whose distance has no closed form; known are {known}")
-    present = sorted({int(kinds[geom]) for geom in geoms})
-    return [(kind, tuple(int(g) for g in geoms if kinds[g] == kind)) for kind in present]
+    groups = render_shapes.groups(model, geoms, known=_DISTANCES)
+    return functools.reduce(jnp.minimum, [_nearest(kind, model, data, np.asarray(ids), points) for kind, ids in groups])
 
 
 def _nearest(kind, model, data, ids, points):
@@ -86,10 +65,14 @@ def _box(size, local):
 
 def _solid(*over):
     """Distance to where all of some orthogonal excesses are negative."""
-    most = over[0]
-    for axis in over[1:]:
-        most = jnp.maximum(most, axis)
+    most = functools.reduce(jnp.maximum, over)
     return jnp.where(most > 0, _norm(*(jnp.maximum(axis, 0.0) for axis in over)), most)
 
 
-_DISTANCES = {PLANE: _plane, SPHERE: _sphere, CAPSULE: _capsule, CYLINDER: _cylinder, BOX: _box}
+_DISTANCES = {
+    render_shapes.PLANE: _plane,
+    render_shapes.SPHERE: _sphere,
+    render_shapes.CAPSULE: _capsule,
+    render_shapes.CYLINDER: _cylinder,
+    render_shapes.BOX: _box,
+}

@@ -89,8 +89,8 @@ def render_over(
     shape = (camera.intrinsics.shape[0], camera.height, camera.width)
     if layer.depth.shape != shape:
         raise ValueError(f"the layer's depth has shape {layer.depth.shape}, the cameras need {shape}")
-    groups, ids = _groups(model, geoms)
-    if not ids:
+    groups = render_shapes.groups(model, geoms)
+    if not groups:
         return layer.replace(camera=camera)
     draw = render_tiles.drawing(tuple(kind for kind, _ in groups), tuple(window), _pick_method(method))
     lens = jax.vmap(_lens)(camera)
@@ -174,19 +174,6 @@ def _pick_method(method):
     if method == "auto":
         return "tiles" if jax.default_backend() == "cpu" else "full"
     return method
-
-
-def _groups(model, geoms):
-    """Sort the geoms by type: a list of (kind, ids)."""
-    kinds = np.asarray(model.geom_type)
-    for geom in geoms:
-        if not 0 <= geom < len(kinds):
-            raise ValueError(f"geom {geom} is not in the model, which has {len(kinds)}")
-        if int(kinds[geom]) not in render_shapes.KINDS:
-            names = ", ".join(render_shapes.KINDS.values())
-            raise ValueError(f"geom {geom} is of mjtGeom type {int(kinds[geom])}, which has no closed form; drawable are {names}")
-    present = sorted({int(kinds[geom]) for geom in geoms})
-    return [(kind, tuple(g for g in geoms if kinds[g] == kind)) for kind in present], tuple(geoms)
 
 
 def _lens(camera):

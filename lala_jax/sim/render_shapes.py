@@ -9,9 +9,12 @@ Geometry stays in float32 and uses no matrix unit.
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
+
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 
 BIG = 1e9  # an inverse depth no plane reaches
 TINY = 1e-12
@@ -169,3 +172,17 @@ _ENTRIES = {
     CYLINDER: _enter_cylinder,
 }
 KINDS = {PLANE: "plane", SPHERE: "sphere", CAPSULE: "capsule", ELLIPSOID: "ellipsoid", CYLINDER: "cylinder", BOX: "box"}
+
+
+def groups(model, geoms: Sequence[int], *, known: Collection[int] = tuple(KINDS)) -> list[tuple[int, tuple[int, ...]]]:
+    """Sort geoms by type: a list of (kind, ids). Raises ValueError on a geom that is not in the model or of no `known` type."""
+    kinds = np.asarray(model.geom_type)
+    for geom in geoms:
+        if not 0 <= geom < len(kinds):
+            raise ValueError(f"geom {geom} is not in the model, which has {len(kinds)}")
+        kind = int(kinds[geom])
+        if kind not in known:
+            name, names = KINDS.get(kind, "other"), ", ".join(KINDS[one] for one in known)
+            raise ValueError(f"geom {geom} is of mjtGeom type {kind} ({name}), which has no closed form; known are {names}")
+    present = sorted({int(kinds[geom]) for geom in geoms})
+    return [(kind, tuple(int(geom) for geom in geoms if kinds[geom] == kind)) for kind in present]

@@ -14,7 +14,7 @@ from lala_jax.perception import transforms
 SPEC = types.MapSpec(cell=0.025, slices=7)  # 40 x 20 cells of 7 slices
 SQUARE = types.MapSpec(y=(-0.25, 0.25), cell=0.025, slices=7)
 SIZES = {"rotations": 8, "crop": 8, "tokens": 24, "embed": 6, "trunk_width": 8, "trunk_blocks": 1, "fine_width": 4, "channels": 2}
-NET = goal_aware.GoalAware(spec=SPEC, **SIZES)
+NET, SQUARE_NET = (goal_aware.GoalAware(spec=spec, **SIZES) for spec in (SPEC, SQUARE))
 PICK = jnp.array([13, 6])
 RED, BLUE, TABLE = (0.9, 0.1, 0.1), (0.1, 0.2, 0.9), (0.2, 0.2, 0.2)
 
@@ -76,6 +76,7 @@ def method(name, net=NET):
 
 run, look, refine = method("__call__"), method("match"), method("refine")
 layout, target, picture = method("layout"), method("target"), method("_picture")
+refine_square = method("refine", SQUARE_NET)
 
 
 def test_shapes(variables):
@@ -83,7 +84,7 @@ def test_shapes(variables):
     assert match.pick.shape == (40, 20) and match.current.shape == (20, 10, 6)
     assert match.token.shape == (24, 3) and match.token_embedding.shape == (24, 6)
     assert match.token_valid.shape == match.token_next.shape == (24,)
-    assert place.logits.shape == (8, 40, 20) and offset.shape == (3,) and fit.shape == ()
+    assert place.shape == (8, 40, 20) and offset.shape == (3,) and fit.shape == ()
     scene = layout(variables, random_map(0), random_map(1))
     assert scene.now.shape == scene.goal.shape == (40, 20, 8) and scene.levels.shape == (40, 20, 7, 7)
     found = target(variables, match, PICK)
@@ -116,16 +117,20 @@ def test_starts_near_zero(variables):
     """Pick and place begin near indifference and the refinement at no offset and any fit, or the first steps go to undoing the start."""
     now, goal = build({(3, 4): [RED], (12, 2): [BLUE]}), build({(8, 6): [RED, BLUE]})
     match, place, (offset, fit) = run(variables, now, goal, PICK)
-    for logits in (match.pick, place.logits):
+    for logits in (match.pick, place):
         assert np.std(logits) < 2 and np.ptp(logits) < 10
     assert np.abs(offset).max() < 0.2 and fit == 0
 
 
+def silenced(variables):
+    """Parameters with which the fine part of the pick says nothing."""
+    params = variables["params"]
+    return {"params": params | {"pick_out": jax.tree.map(jnp.zeros_like, params["pick_out"])}}
+
+
 def test_pick_logits_equal_a_loop_over_tokens(variables):
     """With the fine part silenced, a cell's logit is the log-sum-exp over valid goal tokens of next + <current, token>."""
-    params = dict(variables["params"])
-    params["pick_out"] = jax.tree.map(jnp.zeros_like, params["pick_out"])
-    match = jax.device_get(look({"params": params}, build({(3, 4): [RED], (12, 2): [BLUE]}), build({(8, 6): [RED, BLUE]})))
+    match = jax.device_get(look(silenced(variables), build({(3, 4): [RED], (12, 2): [BLUE]}), build({(8, 6): [RED, BLUE]})))
     assert 0 < match.token_valid.sum() < 24
     for row in range(0, SPEC.rows, 3):
         for col in range(SPEC.cols):
@@ -212,18 +217,16 @@ def test_target_marks_the_matching_colour(variables, picked, other):
 def shown(variables, goal, found):
     """How much of the picked object the place step sees in each column `[rows, cols]`, and how high."""
     scene = layout(variables, goal, goal)
-    weight = jnp.repeat(jnp.repeat(found.weight, 2, 0), 2, 1)
+    weight = goal_aware._upsample(found.weight, goal_aware.POOL)
     return np.moveaxis(np.asarray(picture(variables, scene.goal, scene.levels, weight, found)), -1, 0)[8:10]
 
 
 def test_without_matching_nothing_says_what_looks_alike(variables):
     """The coarse part of the pick is gone, with the fine part silenced all of it; nothing in the goal is the target."""
-    params = dict(variables["params"])
-    params["pick_out"] = jax.tree.map(jnp.zeros_like, params["pick_out"])
-    blunt = NET.clone(matching=False)
-    match = method("match", blunt)({"params": params}, random_map(0), random_map(1))
-    assert not match.pick.any() and look({"params": params}, random_map(0), random_map(1)).pick.any()
-    found = method("target", blunt)({"params": params}, match, PICK)
+    blunt, quiet = NET.clone(matching=False), silenced(variables)
+    match = method("match", blunt)(quiet, random_map(0), random_map(1))
+    assert not match.pick.any() and look(quiet, random_map(0), random_map(1)).pick.any()
+    found = method("target", blunt)(quiet, match, PICK)
     assert not found.weight.any() and not found.level.any()
 
 
@@ -329,43 +332,33 @@ def test_turning_what_is_picked_rolls_the_place_logits(variables, quarters):
 def test_refining_what_was_turned_equals_turning_more(lively, quarters):
     """What is turned by a quarter before it is picked and held at a bin looks as what is held a quarter further."""
     pick, cell, found, goal = jnp.array([9, 9]), jnp.array([12, 7]), random_target(3, SQUARE), random_map(1, SQUARE)
-    ask = functools.cache(lambda: method("refine", SQUARE_NET))()
-
-    def scene(times):
-        return SQUARE_NET.apply(lively, turned(random_map(4, SQUARE), times), goal, method="layout").replace(goal=hidden)
-
     hidden = SQUARE_NET.apply(lively, goal, goal, method="layout").goal  # the height now, which the turn changes, is in it
+    scenes = [SQUARE_NET.apply(lively, turned(random_map(4, SQUARE), times), goal, method="layout") for times in (0, quarters)]
+    still, after = (scene.replace(goal=hidden) for scene in scenes)
     for turn in (0.0, 1.3):
-        direct = ask(lively, scene(0), found, pick, cell, jnp.float32(turn + 2 * quarters))
-        given = ask(lively, scene(quarters), found, pick, cell, jnp.float32(turn))
+        direct = refine_square(lively, still, found, pick, cell, jnp.float32(turn + 2 * quarters))
+        given = refine_square(lively, after, found, pick, cell, jnp.float32(turn))
         jax.tree.map(functools.partial(np.testing.assert_allclose, atol=2e-4, rtol=1e-4), given, direct)
-        other = ask(lively, scene(0), found, pick, cell, jnp.float32(turn))
+        other = refine_square(lively, still, found, pick, cell, jnp.float32(turn))
         assert np.abs(other[0] - direct[0]).max() > 1e-2 and abs(other[1] - direct[1]) > 1e-2
 
 
-SQUARE_NET = goal_aware.GoalAware(spec=SQUARE, **SIZES)
-
-
-@functools.cache
-def _place_square():
-    def place(variables, current, goal, found):
-        scene = SQUARE_NET.apply(variables, current, goal, method="layout")
-        return SQUARE_NET.apply(variables, scene, found, jnp.array([9, 9]), method="place").logits
-
-    return jax.jit(place)
-
-
+@jax.jit
 def placed(variables, current):
     """The place logits of what is picked in the middle of the square map."""
-    return np.asarray(_place_square()(variables, current, random_map(1, SQUARE), random_target(2, SQUARE)))
+    scene = SQUARE_NET.apply(variables, current, random_map(1, SQUARE), method="layout")
+    return SQUARE_NET.apply(variables, scene, random_target(2, SQUARE), jnp.array([9, 9]), method="place")
 
 
 def turned(whole, times, vectors=True):
-    """Turn what a pick in the middle sees by quarters, the places within the cells as well; nothing is left around it."""
+    """Turn what a pick in the middle sees by quarters, the places within the cells as well; nothing is left around it.
+
+    In map axes (row +y, col +x) a turn about +z takes +x (col) to +y (row), against the sense of `rot90`.
+    """
     around = slice(2, 17)  # the pick is in the middle of it
 
     def one(leaf):
-        return jnp.zeros_like(leaf).at[around, around].set(_quarter_turn(leaf[around, around], times))
+        return jnp.zeros_like(leaf).at[around, around].set(np.rot90(leaf[around, around], -times))
 
     out = jax.tree.map(one, whole)
     return out.replace(skin=_turn_vectors(out.skin, times), offset=_turn_vectors(out.offset, times)) if vectors else out
@@ -374,18 +367,6 @@ def turned(whole, times, vectors=True):
 def _turn_vectors(vectors, times):
     xy = transforms.apply_se2(np.array([0, 0, times * np.pi / 2]), np.asarray(vectors, float)[..., ::-1])
     return jnp.asarray(np.asarray(xy)[..., ::-1], jnp.float32)
-
-
-def _quarter_turn(picture, times):
-    """Turn `[n, n, ...]` (rows along +y, cols along +x) about its middle by quarters about world z, one cell after another."""
-    picture, n = np.asarray(picture), len(picture)
-    out, middle = np.zeros_like(picture), n // 2
-    for row in range(n):
-        for col in range(n):
-            y, x = row - middle, col - middle
-            x, y = np.round(transforms.apply_se2(np.array([0, 0, times * np.pi / 2]), np.array([x, y], float))).astype(int)
-            out[y + middle, x + middle] = picture[row, col]
-    return jnp.asarray(out)
 
 
 def test_refine_reads_the_window_under_the_cell_and_around_the_pick(lively):

@@ -26,9 +26,7 @@ def surfaces(points):
     return distance.distance(model, data, points, geoms=scene.static_geoms(model))
 
 
-@functools.cache
-def program():
-    return jax.jit(lambda depth, camera: calibration.calibrate(depth, camera, surfaces))
+calibrate = jax.jit(lambda depth, camera: calibration.calibrate(depth, camera, surfaces))
 
 
 @functools.cache
@@ -44,13 +42,13 @@ def look(name, seed, when, camera):
     return renderer(name)({key: jnp.asarray(leaf, jnp.float32) for key, leaf in leaves.items()}, camera)
 
 
-def moved(camera, seed, far=FAR, wide=WIDE):
-    """Move each camera by `far` metres and turn it about its eye by `wide` degrees, in random directions."""
+def moved(camera, seed):
+    """Move each camera by `FAR` metres and turn it about its eye by `WIDE` degrees, in random directions."""
     rng, poses = np.random.default_rng(seed), np.array(camera.world_from_cam, float)
     for pose in poses:
         direction, axis = rng.normal(size=(2, 3))
-        pose[:3, 3] += far * direction / np.linalg.norm(direction)
-        pose[:3, :3] = Rotation.from_rotvec(np.deg2rad(wide) * axis / np.linalg.norm(axis)).as_matrix() @ pose[:3, :3]
+        pose[:3, 3] += FAR * direction / np.linalg.norm(direction)
+        pose[:3, :3] = Rotation.from_rotvec(np.deg2rad(WIDE) * axis / np.linalg.norm(axis)).as_matrix() @ pose[:3, :3]
     return camera.replace(world_from_cam=jnp.asarray(poses, jnp.float32))
 
 
@@ -72,7 +70,7 @@ def cases():
 
 def test_moved_cameras_are_found_again():
     start = np.stack([errors(nominal(), true) for true, _ in cases()])
-    found = np.stack([errors(program()(depth, nominal()), true) for true, depth in cases()])
+    found = np.stack([errors(calibrate(depth, nominal()), true) for true, depth in cases()])
     assert start.max() > 0.08 and np.median(start) > 0.05
     assert found.max() < 5e-4, f"{found.max() * 1e3:.2f} mm"
     assert np.median(found) < 1e-4
@@ -82,7 +80,7 @@ def test_moved_cameras_are_found_again_through_noise():
     found = []
     for index, (true, depth) in enumerate(cases()):
         noisy = noise.depth_noise(jax.random.key(index), depth, disparity=0.055 * 225)
-        found.append(errors(program()(noisy, nominal()), true))
+        found.append(errors(calibrate(noisy, nominal()), true))
     found = np.stack(found)
     assert np.median(found) < 1.5e-3, f"{np.median(found) * 1e3:.2f} mm"
     assert np.quantile(found, 0.9) < 3e-3
@@ -91,13 +89,13 @@ def test_moved_cameras_are_found_again_through_noise():
 
 @pytest.mark.parametrize("name, seed, when", CASES[::3])
 def test_a_camera_that_was_not_moved_stays(name, seed, when):
-    found = program()(look(name, seed, when, nominal()), nominal())
+    found = calibrate(look(name, seed, when, nominal()), nominal())
     assert errors(found, nominal()).max() < 2e-4
 
 
 def test_poses_stay_rigid_and_lenses_stay():
     true, depth = cases()[0]
-    found = program()(depth, nominal())
+    found = calibrate(depth, nominal())
     rotation = np.asarray(found.world_from_cam)[:, :3, :3]
     np.testing.assert_allclose(rotation @ np.swapaxes(rotation, -1, -2), np.broadcast_to(np.eye(3), (4, 3, 3)), atol=1e-6)
     np.testing.assert_array_equal(np.asarray(found.world_from_cam)[:, 3], np.asarray(nominal().world_from_cam)[:, 3])
@@ -109,7 +107,7 @@ def test_a_view_of_the_table_alone_keeps_x_y_and_yaw():
     model, data = scene.geom_template(tasks.get("tower"))
     true = moved(nominal(), 3)
     bare = render.background(model, data, true, geoms=(0,)).depth
-    found = program()(bare, nominal())
+    found = calibrate(bare, nominal())
     before, after = np.asarray(nominal().world_from_cam, float), np.asarray(found.world_from_cam, float)
     np.testing.assert_allclose(after[:, :2, 3], before[:, :2, 3], atol=1e-6)
     turn = Rotation.from_matrix(after[:, :3, :3] @ np.swapaxes(before[:, :3, :3], -1, -2)).as_rotvec()
@@ -123,7 +121,7 @@ def test_a_view_of_the_table_alone_keeps_x_y_and_yaw():
 def test_a_blind_view_and_one_moved_too_far_keep_the_nominal_pose():
     true, depth = cases()[1]
     depth = depth.at[2].set(0.0)
-    found = program()(depth, nominal())
+    found = calibrate(depth, nominal())
     np.testing.assert_array_equal(found.world_from_cam[2], nominal().world_from_cam[2])
     assert errors(found, true)[[0, 1, 3]].max() < 5e-4
     timid = jax.jit(lambda depth: calibration.calibrate(depth, nominal(), surfaces, limit=(0.01, 0.01)))(depth)
@@ -132,14 +130,14 @@ def test_a_blind_view_and_one_moved_too_far_keep_the_nominal_pose():
 
 def test_jit_equals_eager_and_vmap_equals_a_loop():
     pairs = cases()[:2]
-    loop = [program()(depth, nominal()).world_from_cam for _, depth in pairs]
+    loop = [calibrate(depth, nominal()).world_from_cam for _, depth in pairs]
     eager = calibration.calibrate(pairs[0][1], nominal(), surfaces).world_from_cam
     np.testing.assert_allclose(eager, loop[0], atol=2e-5)
     many = jax.jit(jax.vmap(lambda depth: calibration.calibrate(depth, nominal(), surfaces)))(jnp.stack([depth for _, depth in pairs]))
     np.testing.assert_allclose(many.world_from_cam, jnp.stack(loop), atol=2e-5)
     for view in range(4):
         camera = jax.tree.map(lambda leaf, view=view: leaf[view : view + 1], nominal())
-        alone = program()(pairs[0][1][view : view + 1], camera).world_from_cam
+        alone = calibrate(pairs[0][1][view : view + 1], camera).world_from_cam
         np.testing.assert_allclose(alone[0], loop[0][view], atol=2e-5)
 
 

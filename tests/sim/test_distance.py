@@ -161,7 +161,7 @@ def test_errors_name_what_is_wrong():
     model, data = build(("box", "ellipsoid"), 0)
     model, data = mjx.put_model(model), mjx.put_data(model, data)
     points = jnp.zeros((4, 3))
-    with pytest.raises(ValueError, match="geom 2 is of type ellipsoid.*plane, sphere, capsule, cylinder, box"):
+    with pytest.raises(ValueError, match="geom 2 is of mjtGeom type 4 .ellipsoid.*plane, sphere, capsule, cylinder, box"):
         distance.distance(model, data, points, geoms=(0, 1, 2))
     with pytest.raises(ValueError, match="geom 9 is not in the model"):
         distance.distance(model, data, points, geoms=(9,))

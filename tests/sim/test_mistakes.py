@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from sim.test_oracle import carried, under
 
 from lala_jax.perception import transforms
 from lala_jax.sim import mistakes, oracle, tasks
@@ -72,11 +73,7 @@ def test_a_share_of_none_is_the_oracle_and_a_share_of_all_is_always_wrong(name):
         for field in ("pick", "place", "yaw"):
             np.testing.assert_array_equal(getattr(same, field), getattr(expected, field))
         spoiled = mistakes.act(task, scene, poses, np.random.default_rng(seed), rngs[2], share=1.0)
-        after = poses.copy()
-        moved = np.linalg.norm(poses[:, :3] + [0, 0, 1] * scene.size[:, 2:] / 2 - spoiled.pick, axis=-1).argmin()
-        turn = transforms.pose_from_yaw(np.zeros(3), float(spoiled.yaw))
-        after[moved] = transforms.pose_multiply(turn, transforms.pose_from(poses[moved, :3] - spoiled.pick, poses[moved, 3:]))
-        after[moved, :3] += spoiled.place
+        after = carried(poses, under(scene, poses, spoiled.pick), spoiled)
         assert (after != poses).any() and not (oracle.placed(task, scene, after) & ~oracle.placed(task, scene, poses)).any()
     done = np.asarray(scene.goal, float)
     assert mistakes.act(task, scene, done, *rngs[:2], share=1.0) is None

@@ -143,27 +143,18 @@ def test_task_scenes_with_the_arm_agree_with_mujoco_rays(name):
         mjx_model, mjx_data = mixed(*template, jnp.asarray(poses, jnp.float32))
         data = mujoco.MjData(model)
         data.geom_xpos[:], data.geom_xmat[:] = mjx_data.geom_xpos, np.asarray(mjx_data.geom_xmat).reshape(-1, 9)
-        data.xpos[:], data.xmat[:] = 0, np.eye(3).reshape(-1)
-        fresh = mujoco.MjModel.from_xml_string(static_xml(model, data))
-        state = mujoco.MjData(fresh)
-        mujoco.mj_forward(fresh, state)
-        assert_like_rays(program("tiles")(mjx_model, mjx_data, camera), fresh, state)
+        assert_like_rays(program("tiles")(mjx_model, mjx_data, camera), *frozen(model, data))
 
 
-def static_xml(model, data):
-    """Write the geoms of a scene where they stand, without bodies, so that mj_ray needs no kinematics of ours."""
-    names = {6: "box", 5: "cylinder", 3: "capsule", 2: "sphere", 0: "plane", 4: "ellipsoid"}
-    quat, lines = np.zeros(4), []
+def frozen(model, data):
+    """Compile the geoms of a scene where they stand, without bodies, so that mj_ray needs no kinematics of ours."""
+    quat, geoms = np.zeros(4), []
     for geom in range(model.ngeom):
         mujoco.mju_mat2Quat(quat, data.geom_xmat[geom].copy())
-        kind = names[int(model.geom_type[geom])]
+        kind = mujoco.mjtGeom(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
         size = model.geom_size[geom] if kind != "plane" else [*model.geom_size[geom][:2], 1]
-        text = " ".join
-        lines.append(
-            f'<geom type="{kind}" size="{text(map(str, size))}" pos="{text(map(str, data.geom_xpos[geom]))}"'
-            f' quat="{text(map(str, quat))}" rgba="{text(map(str, model.geom_rgba[geom]))}"/>'
-        )
-    return f"<mujoco><worldbody>{''.join(lines)}</worldbody></mujoco>"
+        geoms.append((kind, size, data.geom_xpos[geom], quat.copy(), model.geom_rgba[geom]))
+    return build(geoms, plane=None)
 
 
 def awkward_geoms():

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 import pytest
 from hypothesis import strategies as st
+from test_augment import closest
 
 from lala_jax.perception import transforms
 from lala_jax.sim import render, robot, tasks
@@ -285,11 +286,11 @@ def test_no_camera_sees_a_distractor_in_the_goal_picture(name, preset):
 @pytest.mark.parametrize("name", tasks.names())
 def test_uniform_colours_are_as_far_apart_as_the_palette_and_are_not_in_it(name):
     paper = np.array(list(base.COLORS.values())) / 255
-    least = min(np.linalg.norm(a - b) for i, a in enumerate(paper) for b in paper[:i])
+    least = closest(paper)
     task = tasks.get(name, colors="uniform", distractors=2)
     drawn = np.stack([task.sample(seed).color for seed in range(40)])
     for color in drawn:
-        assert min(np.linalg.norm(a - b) for i, a in enumerate(color) for b in color[:i]) >= least - 1e-6
+        assert closest(color) >= least - 1e-6
     alone = dataclasses.replace(task, distractors=0)
     np.testing.assert_array_equal(alone.sample(3).color, drawn[3, : task.num_objects])
     assert drawn.min() >= 0 and drawn.max() <= 1
