@@ -59,7 +59,8 @@ def main(
     base = budget(config, steps=steps, demos=demos, start=start, episodes=episodes, seed=seed)
     seeds, runs = build.split_seeds("val", start, episodes), pathlib.Path(build.workdir(config, workdir))
 
-    def finish(done: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    def finish(done: Sequence[dict[str, Any]], kept: Sequence[dict[str, Any]]) -> dict[str, Any]:
+        del kept
         for row in done[1:]:
             row["difference"] = common.difference(row["scores"], done[0]["scores"], paired=True)
         return {"task": task, "split": "val", "steps": steps, "demos": demos, "seed": seed, "reference": done[0]["name"]}

@@ -68,7 +68,7 @@ def fill(
     path: pathlib.Path,
     rows: Sequence[Row],
     run: Callable[[Any], Mapping[str, Any]],
-    finish: Callable[[list[dict[str, Any]]], Mapping[str, Any]],
+    finish: Callable[[list[dict[str, Any]], list[dict[str, Any]]], Mapping[str, Any]],
     *,
     config,
     seeds: Sequence[int],
@@ -76,8 +76,9 @@ def fill(
 ) -> list[dict[str, Any]]:
     """Give the fields of all `rows`; those that are not in the file are run, and the file is written after each.
 
-    A row of the file with a row's name and another `identity` is run again and replaced, other rows stay. `finish` may add to the
-    finished rows, and gives the file's other fields.
+    A row of the file with a row's name and another `identity` is run again and replaced, other rows stay. `finish(done, kept)` may
+    add to the rows that are `done`, and gives the file's other fields; `kept` are all rows of the file that are results of the same
+    seeds and weights, also those not asked for.
     """
     stored = {row["name"]: row for row in json.loads(path.read_text())["rows"]} if path.exists() else {}
     wanted = [identity(row, config, seeds, weights=weights) for row in rows]  # of all, before the first is run
@@ -90,7 +91,8 @@ def fill(
             found = {"name": row.name, **result, "seconds": time.time() - begin, "device": device, **own}
         stored[row.name] = found | {"label": row.label}
         done.append(stored[row.name])
-        writers.write_json(path, {**finish(done), "rows": list(stored.values())})
+        kept = [one for one in stored.values() if all(one[name] == own[name] for name in ("seeds", "checkpoint"))]
+        writers.write_json(path, {**finish(done, kept), "rows": list(stored.values())})
     return done
 
 

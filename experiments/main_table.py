@@ -27,8 +27,9 @@ def main(config, workdir, *, task: str, demos: str, seeds: str, split: str, star
     scored = build.split_seeds(split, start, episodes)
     rows, runs = plan(numbers("--demos", demos), numbers("--seeds", seeds)), build.workdir(config, workdir)
 
-    def finish(done: Sequence[dict[str, Any]]) -> dict[str, Any]:
-        return {"task": task, "split": split, "means": means(done)}
+    def finish(done: Sequence[dict[str, Any]], kept: Sequence[dict[str, Any]]) -> dict[str, Any]:
+        del done
+        return {"task": task, "split": split, "means": means(kept)}
 
     path = pathlib.Path(out or f"experiments/results/{task}") / "main.json"
     done = common.fill(path, rows, lambda row: run(row, base, runs), finish, config=base, seeds=scored)

@@ -44,10 +44,10 @@ def main(config, workdir, *, checkpoint: str, split: str, start: int, episodes: 
     chosen = common.choose(ROWS, rows, name)
     paired = {row.name: same_scenes(config, row.configs(config)[0], seeds) for row in chosen}
 
-    def finish(done: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    def finish(done: Sequence[dict[str, Any]], kept: Sequence[dict[str, Any]]) -> dict[str, Any]:
         for row in done[1:]:
             row["drop"] = common.difference(done[0]["scores"], row["scores"], paired=paired[row["name"]])
-        conditions = {row["label"]: {field: row[field] for field in publish.SCORE} for row in done}
+        conditions = {row["label"]: {field: row[field] for field in publish.SCORE} for row in kept}
         return {"task": name, "split": split, "checkpoint": checkpoint, "reference": done[0]["name"], "conditions": conditions}
 
     path = pathlib.Path(out or f"experiments/results/{name}") / f"robustness-{split}.json"

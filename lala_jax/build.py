@@ -69,6 +69,7 @@ def observer(config: Mapping[str, Any]) -> observe.Observer:
     for name in ("height", "width"):
         _positive(f"camera.{name}", fields[name])
     built = observe.Observer(task=task(config), spec=map_spec(config), **fields)
+    options.check_choice("camera.missing", built.missing, range(-1, len(built.camera.intrinsics)))
     built.check()
     return built
 

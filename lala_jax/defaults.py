@@ -32,7 +32,7 @@ def get(arg: str, *, task: str) -> ml_collections.ConfigDict:
     config.camera.preset = "ring"  # a name in sim.scene.PRESETS
     config.camera.height = 240  # pixels
     config.camera.width = 320
-    config.camera.depth_noise = False
+    config.camera.depth_noise = False  # on every picture; what training adds to some is augment.depth_noise
     config.camera.shift = 0.0  # metres: in evaluation, each episode's cameras are moved by up to so much,
     config.camera.turn = 0.0  # and turned by up to so many degrees, and nobody says so
     config.camera.calibrate = True  # in evaluation, find out where the cameras are from the first pictures of the table and the arm

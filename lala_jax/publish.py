@@ -18,6 +18,8 @@ import shutil
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from lala_jax import build, checkpoint, options, pretrained, state, writers
 
 LARGEST = 12_000_000  # bytes of weights.npz
@@ -102,7 +104,7 @@ def _score_rows(files: Sequence[str], source: str, config: Mapping[str, Any]) ->
     for file in files:
         found = _read_json(file)
         try:
-            if found["agent"] != "policy" or not _same_place(found["checkpoint"], source):
+            if found["agent"] != "policy" or not _same_weights(found["checkpoint"], source):
                 raise options.OptionsError(f"{file} holds scores of {found['checkpoint'] or found['agent']}, not of {source}")
             changed = pretrained.differences(found["config"], config)
             if changed:
@@ -115,8 +117,17 @@ def _score_rows(files: Sequence[str], source: str, config: Mapping[str, Any]) ->
     return rows, settings[0]
 
 
-def _same_place(one: str | None, other: str) -> bool:
-    return one is not None and os.path.abspath(pretrained.find(one)) == os.path.abspath(pretrained.find(other))
+def _same_weights(one: str | None, other: str) -> bool:
+    """Say whether two names stand for the same parameters: the same place, or equal in every leaf."""
+    if one is None:
+        return False
+    if os.path.abspath(pretrained.find(one)) == os.path.abspath(pretrained.find(other)):
+        return True
+    try:
+        there, here = (checkpoint.named(pretrained.load(path)[0]) for path in (one, other))
+    except checkpoint.CheckpointError:  # no longer there: nothing says that it was the same
+        return False
+    return there.keys() == here.keys() and all(np.array_equal(there[name], here[name]) for name in there)
 
 
 def _start(found: Mapping[str, Any]) -> int:
@@ -168,7 +179,7 @@ def _robustness(file: str, task: str, source: str) -> dict[str, Any]:
     """Read the scores in other worlds that `experiments.robustness` writes."""
     found = _read_json(file)
     try:
-        if found["task"] != task or not _same_place(found["checkpoint"], source):
+        if found["task"] != task or not _same_weights(found["checkpoint"], source):
             raise options.OptionsError(f"{file} holds scores of {found['task']}, {found['checkpoint']}, not of {task}, {source}")
         rows = [{"condition": name, **_row(row, (), file)} for name, row in found["conditions"].items()]
         return {"file": file, "split": found["split"], "conditions": rows}

@@ -168,6 +168,9 @@ def _check_shapes(path, params, template) -> None:
 
 def write_scores(config, result, strips, out: pathlib.Path, *, agent: str, split: str, seeds: Sequence[int], source: str | None) -> None:
     """Write `scores-<agent>-<split>.json` and the pictures to `out`, and print the line that matters."""
+    if agent == "policy":  # the only one that is drawn
+        for left in (*out.glob(f"episode-{split}-*.webp"), *out.glob(f"failure-{split}-*.webp")):
+            left.unlink()  # they do not belong to these scores
     for (kind, number), picture in strips.items():
         writers.write_image(out / f"{kind}-{split}-{number}.webp", picture)
     path = out / f"scores-{agent}-{split}.json"

@@ -147,8 +147,9 @@ def final_scores(config, recipe, params, out: pathlib.Path) -> dict[str, Any]:
     fields = config.eval
     seeds = build.split_seeds(fields.split, fields.start, fields.episodes)
     result, strips = scoring.evaluate(
-        recipe.policy, params, recipe.observer, seeds=seeds, parallel=fields.parallel, threads=config.data.threads, strips=fields.strips
-    )
+        recipe.policy, params, recipe.observer, seeds=seeds, parallel=fields.parallel, threads=config.data.threads, strips=fields.strips,
+        seed=config.seed,
+    )  # fmt: skip
     scoring.write_scores(config, result, strips, out, agent="policy", split=fields.split, seeds=seeds, source=str(out / "checkpoints"))
     return result
 

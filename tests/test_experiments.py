@@ -71,8 +71,11 @@ def filled(path, config, *rows, weights=None, fails=()):
         ran.append(row.name)
         return {"score": 50.0}
 
+    def finish(done, kept):
+        return {"count": len(done), "kept": [row["name"] for row in kept]}
+
     try:
-        done = common.fill(path, rows, work, lambda rows: {"count": len(rows)}, config=config, seeds=SEEDS, weights=weights)
+        done = common.fill(path, rows, work, finish, config=config, seeds=SEEDS, weights=weights)
     except KeyboardInterrupt:
         done = None
     return ran, done
@@ -93,7 +96,11 @@ def test_finished_rows_are_kept_and_changed_ones_run_again(tmp_path):
         ("b", "another label", [["seed=4"]]),
         ("c", "c", [[]]),
     ]
-    assert filled(path, config, third)[0] == [] and len(json.loads(path.read_text())["rows"]) == 3  # what was not asked for stays
+    assert filled(path, config, third)[0] == []
+    stored = json.loads(path.read_text())
+    assert len(stored["rows"]) == 3 and stored["count"] == 1 and stored["kept"] == ["a", "b", "c"]  # what was not asked for stays
+    assert filled(path, config, third, weights={"step": 1})[0] == ["c"]
+    assert json.loads(path.read_text())["kept"] == ["c"]  # the others are of other weights
 
 
 def test_what_identifies_a_row(tmp_path):

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lala_jax import losses, observe, types
+from lala_jax import build, defaults, losses, observe, options, types
 from lala_jax.perception import topdown
 from lala_jax.sim import render, scene, tasks
 
@@ -145,9 +145,9 @@ def test_a_camera_that_sees_nothing_adds_no_points():
 
 
 def test_moving_cameras_need_a_rig():
-    for options in ({"shift": 0.01}, {"turn": 1.0}, {"calibrate": True}):
+    for changes in ({"shift": 0.01}, {"turn": 1.0}, {"calibrate": True}):
         with pytest.raises(ValueError, match="needs the rig of Observer.mount"):
-            observer(**options).maps(*(leaf[:1] for leaf in cubes()))
+            observer(**changes).maps(*(leaf[:1] for leaf in cubes()))
     assert not observer().moves and not observer(missing=1, depth_noise=True).moves
 
 
@@ -202,6 +202,12 @@ def test_the_map_of_found_cameras_is_that_of_cameras_that_did_not_move():
         assert both.mean() > 0.9
         assert (np.abs(still.height - mine.height)[both] < 0.002).mean() > 0.98
         assert (np.abs(still.height - deceived.height[index])[both] < 0.002).mean() < 0.5
+
+
+def test_a_missing_camera_must_be_there():
+    for missing in (4, -2):
+        with pytest.raises(options.OptionsError, match=f"camera.missing must be one of -1, 0, 1, 2, 3, got {missing}"):
+            build.observer(options.override(defaults.get("", task="tower"), [f"camera.missing={missing}"]))
 
 
 def test_calibration_alone_leaves_still_cameras_where_they_are():

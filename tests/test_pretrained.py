@@ -15,6 +15,7 @@ from test_scoring import SINGLE, save
 from test_train_step import tiny_config
 
 from lala_jax import build, checkpoint, evaluate, options, pretrained, publish, scoring, writers
+from lala_jax.sim import tasks
 
 SEEDS = [10_002, 10_003]
 
@@ -222,6 +223,15 @@ def test_names_are_looked_up_in_the_package(published, tmp_path, monkeypatch):
         pretrained.load("pretrained/tiny")
 
 
+def test_scores_of_the_same_weights_elsewhere_are_taken(run, published, tmp_path):
+    card = publish.publish(str(published), [str(run[1])], tmp_path / "out")  # the scores name the run's checkpoint
+    assert card["sha256"] == pretrained.card(published)["sha256"]
+    rounded = tmp_path / "rounded"
+    publish.publish(str(run[0]), [str(run[1])], rounded, dtype="bfloat16")
+    with pytest.raises(options.OptionsError, match="holds scores of .*, not of .*rounded"):
+        publish.publish(str(rounded), [str(run[1])], tmp_path / "out")
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -322,7 +332,8 @@ def test_the_command(run, tmp_path, call):
 
 
 def test_the_weights_in_the_package_are_whole():
-    """Of every task that has some: they load, fit the config, are small, and have all three files."""
+    """Every task has some: they load, fit the config, are small, and have all three files."""
+    assert pretrained.names() == sorted(tasks.names())
     for name in pretrained.names():
         card = pretrained.card(f"pretrained/{name}")
         assert card is not None and card["name"] == name == card["config"]["task"]["name"] and card["scores"]
