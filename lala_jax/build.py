@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from lala_jax import checkpoint, dataset, observe, optim, options, policy, train_step, types
-from lala_jax.models import goal_aware, transporter
+from lala_jax.models import goal_aware, graph, transporter
 from lala_jax.sim import scene, tasks
 from lala_jax.sim.tasks import base
 
-MODELS = ("goal_aware", "single", "two_stream", "two_stream_lateral")
+MODELS = ("goal_aware", "single", "two_stream", "two_stream_lateral", "graph")
 SPLITS = ("train", "val", "test")
 TEST_START = 10_001
 WORKDIR = "runs/<task>"  # the default of --workdir
@@ -91,6 +91,8 @@ def build_policy(config: Mapping[str, Any]) -> policy.Policy:
         )  # fmt: skip
         choices = {name: fields[name] for name in ("multi_action", "match_weight", "refine", "max_height", "average_turns")}
         return policy.GoalAwarePolicy(model=model, **choices)
+    if fields["name"] == "graph":
+        return policy.GraphPolicy(model=graph.Graph(width=fields["width"]), spec=spec, multi_action=fields["multi_action"])
     try:
         net = transporter.Transporter(
             variant=fields["name"], yaw_bins=fields["rotations"], width=fields["width"], stages=fields["stages"], **shared

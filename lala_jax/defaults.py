@@ -43,11 +43,11 @@ def get(arg: str, *, task: str) -> ml_collections.ConfigDict:
     config.map.slices = 14
 
     config.model = ml_collections.ConfigDict()
-    config.model.name = "goal_aware"  # or single, two_stream, two_stream_lateral (the paper's)
+    config.model.name = "goal_aware"  # or single, two_stream, two_stream_lateral (the paper's), graph (told the true poses)
     config.model.rotations = 36
     config.model.crop = 24  # cells; 64 for the paper's at full resolution
     config.model.channels = 4  # of key and query
-    config.model.width = 24  # fine maps' channels (goal_aware), or the first stage's (the paper's: 64)
+    config.model.width = 24  # fine maps' channels (goal_aware), the first stage's (the paper's: 64), or nodes' and edges' (graph: 64)
     config.model.stages = 4  # of the paper's hourglass
     config.model.trunk_width = 48
     config.model.trunk_blocks = 3

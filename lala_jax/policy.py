@@ -1,21 +1,22 @@
 """Policies: a network, its loss and its action, behind one interface for training and closed loop. Pure and unbatched.
 
 A policy is a static, hashable object; its parameters travel beside it. `init(key)`, `loss(params, key, state, current, goal)` and
-`act(params, current, goal)` are all that training and evaluation know of it.
+`act(params, current, goal)` are all that training and evaluation know of it; the `act` of a `privileged` one is told the true state too.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
 from lala_jax import losses, types
-from lala_jax.models import goal_aware, transporter
-from lala_jax.perception import topdown
+from lala_jax.models import goal_aware, graph, transporter
+from lala_jax.perception import topdown, transforms
 
 SURFACE_RADIUS = 2  # cells about a point within which its height is the highest seen
 MIDDLE = 0.5  # share of a face's sides within which a pick is taught, as the oracle picks
@@ -132,6 +133,7 @@ class GoalAwarePolicy:
     refine: bool = True
     max_height: bool = False  # see only what is highest in each column
     average_turns: bool = False  # act on the mean of the logits of both maps as they are and turned by 180 degrees
+    privileged: ClassVar[bool] = False
 
     @property
     def spec(self) -> types.MapSpec:
@@ -302,6 +304,7 @@ class TransporterPolicy:
     model: transporter.Transporter
     spec: types.MapSpec
     multi_action: bool = False
+    privileged: ClassVar[bool] = False
 
     def init(self, key: jax.Array):
         """Make the parameters."""
@@ -332,4 +335,54 @@ class TransporterPolicy:
         return action, Heatmaps(logits["pick"], logits["place"])
 
 
-Policy = GoalAwarePolicy | TransporterPolicy
+@dataclasses.dataclass(frozen=True)
+class GraphPolicy:
+    """An upper reference for perception: `models.graph` on true poses. It does not look, and places as exactly as it is told."""
+
+    model: graph.Graph
+    spec: types.MapSpec
+    multi_action: bool = True
+    privileged: ClassVar[bool] = True
+
+    def init(self, key: jax.Array):
+        """Make the parameters."""
+        pose = jnp.zeros((2, 7)).at[:, 3].set(1.0)
+        size, none = jnp.ones((2, 3)), jnp.zeros(2, bool)
+        blank = types.State(size, size, pose[0], pose, jnp.full(2, math.pi), pose, none, none)
+        return self.model.init(key, blank)["params"]
+
+    def loss(self, params, key: jax.Array, state: types.State, current: types.TopDownMap, goal: types.TopDownMap):
+        """Give `(loss, metrics)` of one example: cross-entropy over all pairs, right are the objects that may go next to their goals."""
+        del current, goal
+        logits = self.model.apply({"params": params}, state)
+        right = jnp.diag(state.ready)
+        if not self.multi_action:
+            right &= jnp.arange(len(right))[:, None] == jax.random.categorical(key, jnp.where(state.ready, 0.0, -1e9))
+        loss = losses.masked_cross_entropy(logits, right)
+        index, where = argmax_index(logits)
+        told = state.ready.any()
+        metrics = {"loss": loss, "pick_right": state.ready[index], "place_right": index == where}
+        return loss, {name: value if name == "loss" else jnp.where(told, value, jnp.nan) for name, value in metrics.items()}
+
+    def act(self, params, current: types.TopDownMap, goal: types.TopDownMap, truth: types.State) -> tuple[types.PickPlace, Heatmaps]:
+        """Choose an action: the best object by the middle of its top, to the best goal pose, by the least turn that looks right."""
+        del current, goal
+        logits = self.model.apply({"params": params}, truth)
+        index, where = argmax_index(logits)
+        now, then, size = truth.poses[index], truth.goal[where], truth.size[index]
+        yaw = transforms.yaw_from_quat(then[3:]) - transforms.yaw_from_quat(now[3:])
+        action = types.PickPlace(
+            pick=now[:3].at[2].add(size[2] / 2),
+            place=then[:3].at[2].add(size[2] / 2),
+            yaw=transforms.wrap_angle(yaw, truth.symmetry[index]),
+        )
+        return action, Heatmaps(self._drawn(truth.poses, logits.max(1)), self._drawn(truth.goal, logits[index])[None])
+
+    def _drawn(self, poses, logits):
+        """Put each object's logit on the cell under it, `[rows, cols]`."""
+        cell = jnp.clip(types.index_from_world(self.spec, poses[:, :2]), 0, jnp.array([self.spec.rows - 1, self.spec.cols - 1]))
+        low = jnp.full((self.spec.rows, self.spec.cols), logits.min() - 10.0)
+        return low.at[cell[:, 0], cell[:, 1]].max(logits)
+
+
+Policy = GoalAwarePolicy | TransporterPolicy | GraphPolicy

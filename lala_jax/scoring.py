@@ -32,9 +32,17 @@ def mount_batch(observer: observe.Observer, key: jax.Array, scenes: types.Scene)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def act_batch(agent: policy.Policy, params: Any, current: types.TopDownMap, goal: types.TopDownMap):
-    """Act in B scenes, one after another: `(PickPlace, best pick and place logits)` with leaves `[B, ...]`."""
-    return jax.lax.map(lambda maps: agent.act(params, *maps), (current, goal))
+def act_batch(agent: policy.Policy, params: Any, scenes: types.Scene, poses: jax.Array, current: types.TopDownMap, goal: types.TopDownMap):
+    """Act in B scenes, one after another: `(PickPlace, best pick and place logits)` with leaves `[B, ...]`.
+
+    Only a privileged policy is told the scene and the `poses` `[B, N, 7]`, and not what is placed or may go next.
+    """
+    if not agent.privileged:
+        return jax.lax.map(lambda maps: agent.act(params, *maps), (current, goal))
+    untold = jnp.zeros(poses.shape[:2], bool)
+    fields = {name: getattr(scenes, name) for name in ("size", "color", "base", "goal", "symmetry")}
+    truth = types.State(**fields, poses=poses, placed=untold, ready=untold)
+    return jax.lax.map(lambda seen: agent.act(params, *seen), (current, goal, truth))
 
 
 @jax.jit
@@ -62,8 +70,9 @@ class PolicyAgent:
         index = np.resize(indices, self._parallel)
         poses = np.resize(poses, (self._parallel, *np.shape(poses)[1:]))
         scenes, rig, goal = _take((self._scenes, self.rig, self.goal), index)
-        current = self._look(scenes, jnp.asarray(poses, jnp.float32), rig)
-        return current, *act_batch(self._agent, self._params, current, goal)
+        poses = jnp.asarray(poses, jnp.float32)
+        current = self._look(scenes, poses, rig)
+        return current, *act_batch(self._agent, self._params, scenes, poses, current, goal)
 
     def __call__(self, indices: Sequence[int], poses: np.ndarray) -> list[types.PickPlace]:
         action = jax.device_get(self._think(indices, poses)[1])

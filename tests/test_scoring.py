@@ -109,6 +109,28 @@ def test_episodes_are_drawn_as_their_own_cameras_saw_them(built, changes):
     assert count == len(episode.actions) and np.mean(np.abs(goal.rgb - full.rgb).max(-1) > 0.02) < 0.01
 
 
+def test_a_privileged_policy_is_told_where_things_are():
+    """Of two episodes at different moments, each is told its own objects; what is placed or may go next is not said."""
+    config, told = tiny_config("model.name=graph"), []
+    agent, observer = build.build_policy(config), build.observer(config)
+    scenes = [observer.task.sample(seed) for seed in SEEDS[:2]]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(type(agent.model), "apply", lambda self, variables, state: _spied(state, told))
+        actor = scoring.PolicyAgent(agent, {}, observer, scenes, parallel=3, key=jax.random.key(0))
+        poses = np.stack([scenes[1].goal, scenes[0].start]).astype(np.float32)
+        actions = actor([1, 0], poses)
+    for action, now, scene_ in zip(actions, poses, scenes[::-1], strict=True):
+        np.testing.assert_allclose(action.pick[:2], now[-1, :2], atol=1e-6)
+        np.testing.assert_allclose(action.place[:2], scene_.goal[-1, :2], atol=1e-6)
+    assert told and not any(np.any(said) for said in told)
+
+
+def _spied(state, told):
+    """Logits that send the last object home; what is said of placed and ready objects goes to `told`."""
+    jax.debug.callback(lambda *said: told.append(said), state.placed, state.ready)
+    return jnp.zeros((len(state.size),) * 2).at[-1, -1].set(1.0)
+
+
 def test_scores_and_pictures_are_written(alone, tmp_path, capsys):
     summary, drawn, _ = alone
     config = tiny_config(*SINGLE)
