@@ -2,7 +2,7 @@
 
 The config comes from the checkpoint; `--config.camera.preset=paper` and the like change it. `--checkpoint=pretrained/tower` repeats the
 reported score of the weights that ship with the package, and ends with status 1 where it comes out outside the reported interval. The
-agents that need no training are scored with `--config=configs/tower.py --agent=oracle` or `--agent=blind`.
+agents that need no training are scored with `--config=configs/tower.py --agent=oracle`, `blind` or `top_view`.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from typing import Any
 from lala_jax import build, options, pretrained, scoring, writers
 
 FLAGS = {"checkpoint": "", "agent": "policy", "split": "", "start": -1, "episodes": 0}
-NO_CHECKPOINT = "give --checkpoint=PATH, or --config=FILE.py with --agent=oracle or --agent=blind"
+NO_CHECKPOINT = "give --checkpoint=PATH, or --config=FILE.py with --agent=oracle, blind or top_view"
 
 
 def main(config, workdir, *, checkpoint: str, agent: str, split: str, start: int, episodes: int) -> dict[str, Any]:
-    """Score the checkpoint, or the oracle or the blind agent, and write scores and pictures to the work directory."""
+    """Score the checkpoint, or an agent that needs no training, and write scores and pictures to the work directory."""
     options.check_choice("--agent", agent, scoring.AGENTS)
     split, threads, strips = split or config.eval.split, config.data.threads, {}
     seeds = build.split_seeds(split, start if start >= 0 else config.eval.start, episodes or config.eval.episodes)

@@ -120,9 +120,9 @@ def cause(scene: types.Scene, ready: np.ndarray, before: np.ndarray, after: np.n
     return "wrong yaw" if abs(off) >= oracle.TURN else "wrong height"
 
 
-def oracle_agent(task: base.Task, scenes: Sequence[types.Scene], seeds: Sequence[int], *, blind: bool = False) -> Agent:
-    """Make the oracle an agent, or the blind one that knows the places but not what belongs there."""
-    choose = oracle.blind if blind else oracle.act
+def oracle_agent(task: base.Task, scenes: Sequence[types.Scene], seeds: Sequence[int], name: str = "oracle") -> Agent:
+    """Make one of `oracle.AGENTS` an agent: the oracle, or one that knows the places but not, or not always, what belongs there."""
+    choose = oracle.AGENTS[name]
     rngs = [np.random.default_rng([seed, 1]) for seed in seeds]
 
     def agent(indices, poses):

@@ -1,4 +1,4 @@
-"""Score agents in closed loop: policies over the batch renderer, the oracle, the blind agent; pictures of what happened."""
+"""Score agents in closed loop: policies over the batch renderer, the oracle and its blind kin; pictures of what happened."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from lala_jax import build, checkpoint, observe, options, pictures, policy, pretrained, rollout, types, writers
+from lala_jax.sim import oracle
 
-AGENTS = ("policy", "oracle", "blind")
+AGENTS = ("policy", *oracle.AGENTS)
 FAILURES = 3  # failed episodes that are drawn
 
 
@@ -116,10 +117,10 @@ def evaluate(
 
 
 def baseline(name: str, observer_task, *, seeds: Sequence[int], threads: int) -> dict[str, Any]:
-    """Score the oracle or the blind agent on `seeds`, through the real primitive."""
-    options.check_choice("agent", name, AGENTS[1:])
+    """Score one of `oracle.AGENTS`, which need no training, on `seeds`, through the real primitive."""
+    options.check_choice("agent", name, oracle.AGENTS)
     scenes = [observer_task.sample(seed) for seed in seeds]
-    agent = rollout.oracle_agent(observer_task, scenes, seeds, blind=name == "blind")
+    agent = rollout.oracle_agent(observer_task, scenes, seeds, name)
     return rollout.summary(rollout.run(observer_task, scenes, seeds, agent, threads=threads))
 
 

@@ -144,10 +144,10 @@ def test_a_process_ends_with_status_2(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "messages"),
     [
-        ([], ["give --checkpoint=PATH, or --config=FILE.py with --agent=oracle or --agent=blind"]),
+        ([], ["give --checkpoint=PATH, or --config=FILE.py with --agent=oracle, blind or top_view"]),
         (["--checkpoint=nowhere"], ["no checkpoint at .*nowhere"]),
         (["--chekpoint=nowhere"], ["unknown argument '--chekpoint=nowhere'; did you mean --checkpoint"]),
-        (["--config=configs/tower.py", "--agent=random"], ["--agent must be one of 'policy', 'oracle', 'blind', got 'random'"]),
+        (["--config=configs/tower.py", "--agent=random"], ["--agent must be one of 'policy', 'oracle', 'blind', 'top_view', got 'random'"]),
         (["--config=configs/tower.py", "--agent=oracle", "--split=dev"], ["split must be one of 'train', 'val', 'test', got 'dev'"]),
         (["--config=configs/tower.py", "--agent=oracle", "--start=4990"], [r"the val split has 5000 seeds, asked for 4990\.\."]),
         (["--config=configs/tower.py:small"], [r"config argument must be one of \('', 'smoke', 'paper'\), got 'small'"]),

@@ -147,7 +147,7 @@ def test_merged_quarters_equal_one_summary():
     task = tasks.get("tower", num_objects=2)
     episodes = run(task, [0, 2]) + run(task, [4], constant(None))
     scenes = [task.sample(6)]
-    episodes += rollout.run(task, scenes, [6], rollout.oracle_agent(task, scenes, [6], blind=True), threads=1)
+    episodes += rollout.run(task, scenes, [6], rollout.oracle_agent(task, scenes, [6], "blind"), threads=1)
     parts = [[episodes[i] for i in share] for share in robustness.shares(range(4), 3)]
     assert robustness.merged([rollout.summary(part) for part in parts]) == rollout.summary(episodes)
     assert robustness.merged([rollout.summary(episodes)]) == rollout.summary(episodes)

@@ -180,7 +180,7 @@ def test_a_checkpoint_of_another_model_is_refused(tmp_path, change, message):
 
 
 def test_an_unknown_agent_is_refused():
-    with pytest.raises(options.OptionsError, match="agent must be one of 'oracle', 'blind', got 'random'"):
+    with pytest.raises(options.OptionsError, match="agent must be one of 'oracle', 'blind', 'top_view', got 'random'"):
         scoring.baseline("random", build.task(tiny_config()), seeds=SEEDS, threads=1)
 
 

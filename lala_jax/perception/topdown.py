@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from lala_jax import types
 from lala_jax.perception import camera as cameras
+from lala_jax.perception import image
 
 
 def fuse(
@@ -110,6 +112,36 @@ def from_views_batch(
         return from_views(example[0], spec=spec, features=example[1], **margins)
 
     return jax.lax.map(one, (views, features)) if method == "map" else jax.vmap(one)((views, features))
+
+
+def surface_features(
+    views: types.Views,
+    features: Float[Array, "v h w c"],
+    *,
+    spec: types.MapSpec,
+    floor_margin: float = 0.01,
+    surface_margin: float = 0.001,
+) -> Float[Array, "rows cols c"]:
+    """Fuse per-view feature maps of any resolution into one map of the surface: LALA's feature fusion (section IV, figure 2).
+
+    Each view gives a cell the feature, read bilinearly, of the highest point that it saw there; a cell's value is the mean over the
+    views that saw it, 0 where none did. Which points count is as in `fuse`. The order of the views does not matter.
+    """
+    scale = np.array([features.shape[1] / views.depth.shape[1], features.shape[2] / views.depth.shape[2]], np.float32)
+    most = np.array(features.shape[1:3], np.float32) - 0.5  # beyond the outermost centres the outermost values hold
+
+    def one(depth, camera, grid):
+        points = cameras.unproject(depth, camera).reshape(-1, 3)
+        _, cell, height = _locate(points, (depth > 0).ravel(), spec, floor_margin, surface_margin)
+        top = jnp.full(spec.rows * spec.cols, -jnp.inf).at[cell].max(height, **_DROP)
+        highest = height >= top.at[cell].get(mode="fill", fill_value=jnp.inf)
+        pixel = jnp.full(spec.rows * spec.cols, -1).at[jnp.where(highest, cell, spec.rows * spec.cols)].max(jnp.arange(len(cell)), **_DROP)
+        at = (jnp.stack([pixel // depth.shape[1], pixel % depth.shape[1]], axis=-1) + 0.5) * scale
+        seen = (pixel >= 0)[:, None]
+        return jnp.where(seen, image.sample(grid, jnp.clip(at, 0.5, most)), 0.0), seen
+
+    value, seen = jax.vmap(one)(views.depth, views.camera, features)
+    return (value.sum(0) / jnp.maximum(seen.sum(0), 1)).reshape(spec.rows, spec.cols, -1)
 
 
 def max_height(topdown: types.TopDownMap) -> Float[Array, "rows cols channels"]:

@@ -217,18 +217,35 @@ def act(task: base.Task, scene: types.Scene, poses: np.ndarray, rng: np.random.G
     return None if chosen is None else move(scene, poses, *chosen, rng)
 
 
-def blind(task: base.Task, scene: types.Scene, poses: np.ndarray, rng: np.random.Generator) -> types.PickPlace | None:
+def blind(
+    task: base.Task, scene: types.Scene, poses: np.ndarray, rng: np.random.Generator, *, known: np.ndarray | None = None
+) -> types.PickPlace | None:
     """Choose an action that ignores which object belongs where: a random object that is nowhere yet to a random supported free place.
 
     It knows all places but neither order nor sizes, and takes distractors too: what a policy that never looks at the goal's identities
-    can reach. None when nothing is left to do.
+    can reach. Of the objects that are `known` `[N]` bool it knows the place: they go there and nowhere else. None when nothing is
+    left to do.
     """
     poses, goal = np.asarray(poses, float), np.asarray(scene.goal, float)
+    known = np.zeros(len(poses), bool) if known is None else known
     offset = np.abs(poses[:, None, :3] - goal[None, :, :3])  # [object, place, axis]
     at = (offset[..., :2] < 0.025).all(-1) & (offset[..., 2] < 0.02)
     occupied = at.any(0)
     places = np.flatnonzero(~occupied & wanted(scene) & supported(task, scene, occupied))
-    objects = np.flatnonzero(~at.any(1) & pickable(scene, poses))
-    if not len(places) or not len(objects):
-        return None
-    return move(scene, poses, int(rng.choice(objects)), goal[rng.choice(places)], rng)
+    free = ~at.any(1) & pickable(scene, poses)
+    for place in rng.permutation(places):
+        objects = np.flatnonzero(free & (np.arange(len(poses)) == place if known[place] else ~known))
+        if len(objects):
+            return move(scene, poses, int(rng.choice(objects)), goal[place], rng)
+    return None
+
+
+def top_view(task: base.Task, scene: types.Scene, poses: np.ndarray, rng: np.random.Generator) -> types.PickPlace | None:
+    """Choose an action knowing of the goal what is seen from right above, else perfect: `blind` but for the objects with nothing on top.
+
+    What a policy on a max-height map of the goal can reach.
+    """
+    return blind(task, scene, poses, rng, known=wanted(scene) & ~_on_top(scene, scene.goal).any(-1))
+
+
+AGENTS = {"oracle": act, "blind": blind, "top_view": top_view}

@@ -249,6 +249,54 @@ def test_more_features_ride_along_and_any_number_of_views_works():
     assert 0 < single.count.sum() < plain.count.sum()
 
 
+def rough_views(seed=0):
+    """Views of nothing in particular: every pixel at a depth of its own, some without."""
+    views, rng = table_views(size=(24, 32)), np.random.default_rng(seed)
+    depth = np.where(views.depth > 0, views.depth * rng.uniform(0.9, 1.0, views.depth.shape), 0.0)
+    return views.replace(depth=jnp.asarray(depth * (rng.random(depth.shape) < 0.9), jnp.float32))
+
+
+surface_features = jax.jit(topdown.surface_features, static_argnames="spec")
+
+
+def slow_surface(views, features):
+    """Look for every cell's highest point in every view, read the feature there, and average."""
+    total, count = np.zeros((SPEC.rows, SPEC.cols, features.shape[-1])), np.zeros((SPEC.rows, SPEC.cols, 1))
+    points = np.asarray(jax.jit(jax.vmap(camera.unproject))(views.depth, views.camera))
+    for cloud_, depth, grid in zip(points, np.asarray(views.depth), features, strict=True):
+        best = {}
+        for i, j in np.argwhere(depth > 0):
+            x, y, z = cloud_[i, j]
+            cell = int(np.floor((y - SPEC.y[0]) / SPEC.cell)), int(np.floor((x - SPEC.x[0]) / SPEC.cell))
+            inside = 0 <= cell[0] < SPEC.rows and 0 <= cell[1] < SPEC.cols and -0.01 <= z < SPEC.z[1]
+            if inside and z >= best.get(cell, (-1,))[0]:
+                best[cell] = z, (i + 0.5) / depth.shape[0] * grid.shape[0], (j + 0.5) / depth.shape[1] * grid.shape[1]
+        for cell, (_, row, col) in best.items():
+            row, col = (np.clip(at - 0.5, 0, n - 1) for at, n in ((row, grid.shape[0]), (col, grid.shape[1])))
+            i, j = (min(int(at), n - 2) for at, n in ((row, grid.shape[0]), (col, grid.shape[1])))
+            a, b = row - i, col - j
+            above, below = ((1 - b) * grid[k, j] + b * grid[k, j + 1] for k in (i, i + 1))
+            total[cell] += (1 - a) * above + a * below
+            count[cell] += 1
+    return total / np.maximum(count, 1), count[..., 0]
+
+
+def test_features_of_the_surface_equal_a_loop_and_any_order_of_views():
+    views, features = rough_views(), np.random.default_rng(1).normal(size=(4, 5, 7, 3)).astype(np.float32)
+    found = np.asarray(surface_features(views, features, spec=SPEC))
+    slow, count = slow_surface(views, features)
+    assert found.shape == (SPEC.rows, SPEC.cols, 3) and set(np.unique(count)) >= {1, 2, 3}
+    same = np.isclose(found, slow, atol=1e-4).all(-1)
+    assert same.mean() > 0.97, "a point on a cell's border may round either way"
+    order = np.array([2, 0, 3, 1])
+    mixed = surface_features(jax.tree.map(lambda leaf: leaf[order], views), features[order], spec=SPEC)
+    np.testing.assert_allclose(mixed, found, atol=1e-5)
+    blind = views.replace(depth=views.depth.at[1:].set(0.0))
+    alone, seen = slow_surface(blind, features)
+    found = np.asarray(surface_features(blind, features, spec=SPEC))
+    assert (found[seen == 0] == 0).mean() > 0.97 and np.isclose(found, alone, atol=1e-4).all(-1).mean() > 0.97
+
+
 def test_a_batch_is_the_same_by_map_and_by_vmap():
     batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), table_views(), table_views((3, 2, 1, 0)))
     loop = [from_views(jax.tree.map(lambda leaf: leaf[i], batch), spec=SPEC, floor_margin=0.02) for i in range(2)]  # noqa: B023

@@ -234,6 +234,24 @@ def test_blind_fills_the_pallet():
     assert oracle.score(task, scene, poses) < 100.0
 
 
+@pytest.mark.parametrize(("name", "seen"), [("tower", 1), ("pallet", 4)])
+def test_the_view_from_above_places_what_it_sees_and_deals_the_rest(name, seen):
+    """The top of the tower, the upper layer of the pallet; of the hidden ones, one is right by chance."""
+    task, hidden, wrong = tasks.get(name), [], set()
+    for seed in range(24):
+        scene = task.sample(seed % 6)
+        top = goal(scene)[:, 2] > goal(scene)[:, 2].max() - 0.01
+        assert top.sum() == seen
+        poses, count = run(task, scene, start(scene), oracle.top_view, np.random.default_rng(seed))
+        assert count == task.num_objects
+        off = np.linalg.norm(poses[:, :3] - goal(scene)[:, :3], axis=-1)
+        np.testing.assert_allclose(off[top], 0.0, atol=1e-5)
+        hidden.append((off[~top] < 1e-5).sum())
+        wrong |= {seed} if hidden[-1] < (~top).sum() else set()
+    # The number of fixed points of a random order has mean 1 and variance 1.
+    assert np.mean(hidden) == pytest.approx(1.0, abs=4 / np.sqrt(24)) and len(wrong) > 12
+
+
 @pytest.mark.parametrize("name", tasks.names())
 def test_distractors_never_count_and_are_never_ready(name):
     plain, task = tasks.get(name), tasks.get(name, distractors=2)
