@@ -99,7 +99,7 @@ def build_policy(config: Mapping[str, Any]) -> policy.Policy:
         )
     except ValueError as error:
         raise options.OptionsError(str(error)) from error
-    return policy.TransporterPolicy(model=net, spec=spec, multi_action=fields["multi_action"])
+    return policy.TransporterPolicy(model=net, spec=spec, multi_action=fields["multi_action"], max_height=fields["max_height"])
 
 
 def recipe(config: Mapping[str, Any]) -> train_step.Recipe:

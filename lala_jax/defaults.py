@@ -121,6 +121,7 @@ def _enlarge(config) -> None:
     config.model.channels = 3
     config.model.width = 64
     config.model.multi_action = False
+    config.model.max_height = True
     config.optim.schedule = "constant"
     config.optim.learning_rate = 1e-4
     config.optim.weight_decay = 0.0

@@ -299,11 +299,15 @@ class GoalAwarePolicy:
 
 @dataclasses.dataclass(frozen=True)
 class TransporterPolicy:
-    """The paper's agents and their rivals: `models.transporter` on max-height maps, one-hot labels unless `multi_action`."""
+    """The paper's agents and their rivals: `models.transporter`, one-hot labels unless `multi_action`.
+
+    They see max-height maps, in which a finished tower is its top block; without `max_height`, all slices as channels.
+    """
 
     model: transporter.Transporter
     spec: types.MapSpec
     multi_action: bool = False
+    max_height: bool = True
     privileged: ClassVar[bool] = False
 
     def init(self, key: jax.Array):
@@ -312,7 +316,9 @@ class TransporterPolicy:
         return self.model.init(key, blank, blank, jnp.zeros(2, jnp.int32))["params"]
 
     def _input(self, topdown_map):
-        return transporter.normalise(topdown.max_height(topdown_map))
+        if self.max_height:
+            return transporter.normalise(topdown.max_height(topdown_map))
+        return transporter.normalise_slices(topdown_map.features[..., :3], topdown_map.count > 0, topdown_map.height)
 
     def loss(self, params, key: jax.Array, state: types.State, current: types.TopDownMap, goal: types.TopDownMap):
         """Give `(loss, metrics)` of one example: cross-entropy of pick and place (eqs. 4-6)."""

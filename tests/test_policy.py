@@ -407,6 +407,21 @@ def test_transporters_lose_finitely_and_act_on_the_map(name):
         check_action(agent, *jax.tree.map(lambda leaf, index=index: leaf[index], (actions, heats, batch[2])))
 
 
+def test_only_slices_show_what_is_under_the_top():
+    """Two goals that differ in a hidden block's colour are one max-height map, and two maps of slices."""
+    state = state_of(0)
+    swapped = state.replace(color=state.color.at[0].set(1 - state.color[0]))
+    blunt = POLICIES["single"]
+    goals = [map_of(one, one.goal) for one in (state, swapped)]
+    for agent, same in ((blunt, True), (dataclasses.replace(blunt, max_height=False), False)):
+        inner = [agent._input(goal)[..., :-1] for goal in goals]
+        inside = np.abs(np.asarray(inner[0] - inner[1])).max(-1)
+        top = types.index_from_world(SPEC, state.goal[-1, :2])
+        assert (inside[tuple(top)] == 0) == same
+    params = agent.init(jax.random.key(0, impl="rbg"))
+    assert params["pick_net"]["difference"]["stem"]["kernel"].shape[2] == 4 * SPEC.slices + 1
+
+
 def means(metrics):
     """The mean of every metric over some steps."""
     return {name: float(np.mean([one[name] for one in metrics])) for name in metrics[0]}

@@ -11,7 +11,7 @@ from test_train_step import tiny_config
 from lala_jax import build, checkpoint, options, pictures, rollout, scoring, types
 from lala_jax.sim import render, scene
 
-SINGLE = ("model.name=single", "model.stages=1", "model.multi_action=false")
+SINGLE = ("model.name=single", "model.stages=1", "model.multi_action=false", "model.max_height=true")
 SEEDS = [1, 3, 5]
 
 

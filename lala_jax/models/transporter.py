@@ -9,7 +9,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from lala_jax.models import blocks, correlation, streams
 from lala_jax.perception import image
@@ -29,6 +29,18 @@ def normalise(max_height: Float[Array, "rows cols c"]) -> Float[Array, "rows col
     color, features, height = jnp.split(max_height, (3, max_height.shape[-1] - 1), axis=-1)
     color, height = (color - COLOR_MEAN) / COLOR_STD, (height - HEIGHT_MEAN) / HEIGHT_STD
     return jnp.concatenate([color, features, height], axis=-1)
+
+
+def normalise_slices(
+    color: Float[Array, "rows cols slices 3"], seen: Bool[Array, "rows cols slices"], height: Float[Array, "rows cols"]
+) -> Float[Array, "rows cols c"]:
+    """Lay the height slices of a map side by side as channels, normalised as in `normalise`: r, g, b and seen of each, then the height.
+
+    What nothing was seen in is 0 in all four.
+    """
+    values = jnp.where(seen[..., None], (color - COLOR_MEAN) / COLOR_STD, 0.0)
+    flat = jnp.concatenate([values, seen[..., None].astype(values.dtype)], axis=-1).reshape(*height.shape, -1)
+    return jnp.concatenate([flat, (height[..., None] - HEIGHT_MEAN) / HEIGHT_STD], axis=-1)
 
 
 def pick_crops(maps: Float[Array, "rows cols c"], pick_cell: Int[Array, 2], *, yaw_bins: int, crop: int) -> Float[Array, "k crop crop c"]:

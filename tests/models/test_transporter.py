@@ -236,6 +236,19 @@ def test_normalising_undoes_the_statistics_and_passes_features():
     np.testing.assert_allclose(transporter.normalise(jnp.asarray(seen)), plain, atol=1e-5)
 
 
+def test_slices_lie_side_by_side():
+    rng = np.random.default_rng(0)
+    color, height = rng.uniform(size=(3, 2, 4, 3)).astype(np.float32), rng.uniform(size=(3, 2)).astype(np.float32)
+    seen = rng.random((3, 2, 4)) < 0.5
+    found = transporter.normalise_slices(jnp.asarray(color), jnp.asarray(seen), jnp.asarray(height))
+    assert found.shape == (3, 2, 17)
+    for index in np.ndindex(3, 2, 4):
+        own = found[index[:2]][4 * index[2] : 4 * index[2] + 4]
+        wanted = [*(color[index] - transporter.COLOR_MEAN) / transporter.COLOR_STD, 1.0] if seen[index] else np.zeros(4)
+        np.testing.assert_allclose(own, wanted, rtol=1e-5)
+    np.testing.assert_allclose(found[..., -1], (height - transporter.HEIGHT_MEAN) / transporter.HEIGHT_STD, rtol=1e-5)
+
+
 @pytest.mark.parametrize(
     "options, message",
     [
