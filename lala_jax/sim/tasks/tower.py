@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
@@ -60,4 +61,9 @@ class TowerTask(base.Task):
 
     def sentence(self, scene: types.Scene) -> str:
         """Say the goal for a language-conditioned baseline, bottom to top."""
-        return f"make the tower with {', '.join(base.color_name(rgb) for rgb in np.asarray(scene.color)[: self.num_objects])} blocks"
+        return sentence([base.color_name(rgb) for rgb in np.asarray(scene.color)[: self.num_objects]])
+
+
+def sentence(colors: Sequence[str]) -> str:
+    """Say the goal of a tower of blocks with these colour names, bottom to top, as the paper did."""
+    return f"make the tower with {', '.join(colors)} blocks"
