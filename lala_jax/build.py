@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lala_jax import checkpoint, dataset, observe, optim, options, policy, train_step, types
-from lala_jax.models import goal_aware, graph, transporter
+from lala_jax.models import goal_aware, graph, resnet, transporter
 from lala_jax.sim import scene, tasks
 from lala_jax.sim.tasks import base
 
@@ -68,10 +68,20 @@ def observer(config: Mapping[str, Any]) -> observe.Observer:
     options.check_choice("camera.preset", fields["preset"], scene.PRESETS)
     for name in ("height", "width"):
         _positive(f"camera.{name}", fields[name])
+    surface(config)
     built = observe.Observer(task=task(config), spec=map_spec(config), **fields)
     options.check_choice("camera.missing", built.missing, range(-1, len(built.camera.intrinsics)))
     built.check()
     return built
+
+
+def surface(config: Mapping[str, Any]) -> int:
+    """Give the number of pretrained features that the map's surface has; 0 without a backbone."""
+    name, stage = (config["camera"].get(field, "") for field in ("backbone", "stage"))  # configs in checkpoints may be older
+    if not name:
+        return 0
+    options.check_choice("camera.stage", stage, resnet.STAGES)
+    return 64 if stage == "stem" else resnet.layers(stage)[f"{stage}_1/expand"][-1]
 
 
 def build_policy(config: Mapping[str, Any]) -> policy.Policy:
@@ -81,6 +91,9 @@ def build_policy(config: Mapping[str, Any]) -> policy.Policy:
     for name in ("rotations", "crop", "channels", "width", "stages", "trunk_width", "tokens"):
         _positive(f"model.{name}", fields[name])
     shared = {"crop": fields["crop"], "channels": fields["channels"]}
+    if surface(config) and fields["name"] not in transporter.VARIANTS:
+        known = ", ".join(transporter.VARIANTS)
+        raise options.OptionsError(f"model.name {fields['name']!r} takes no camera.backbone; those that do are {known}")
     if fields["name"] == "goal_aware":
         if spec.rows % 4 or spec.cols % 4 or fields["crop"] % 4:
             sizes = f"{spec.rows}, {spec.cols} and {fields['crop']}"
@@ -99,7 +112,8 @@ def build_policy(config: Mapping[str, Any]) -> policy.Policy:
         )
     except ValueError as error:
         raise options.OptionsError(str(error)) from error
-    return policy.TransporterPolicy(model=net, spec=spec, multi_action=fields["multi_action"], max_height=fields["max_height"])
+    choices = {name: fields[name] for name in ("multi_action", "max_height")}
+    return policy.TransporterPolicy(model=net, spec=spec, surface=surface(config), **choices)
 
 
 def recipe(config: Mapping[str, Any]) -> train_step.Recipe:
@@ -130,7 +144,9 @@ def run_settings(config: Mapping[str, Any]) -> dict[str, Any]:
 def input_spec(config: Mapping[str, Any]) -> dict[str, Any]:
     """Say what the policy expects to see, to be stored beside its parameters."""
     spec = map_spec(config)
+    more = {"surface": f"{config['camera']['backbone']} {config['camera']['stage']}"} if surface(config) else {}
     return {
+        **more,
         "map": {"rows": spec.rows, "cols": spec.cols, "slices": spec.slices, "features": 3},
         "x": list(spec.x), "y": list(spec.y), "z": list(spec.z), "cell": spec.cell,
         "features": "RGB in 0..1, mean per voxel",

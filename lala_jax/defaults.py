@@ -36,6 +36,8 @@ def get(arg: str, *, task: str) -> ml_collections.ConfigDict:
     config.camera.shift = 0.0  # metres: in evaluation, each episode's cameras are moved by up to so much,
     config.camera.turn = 0.0  # and turned by up to so many degrees, and nobody says so
     config.camera.calibrate = True  # in evaluation, find out where the cameras are from the first pictures of the table and the arm
+    config.camera.backbone = ""  # pretrained features to fuse (the paper's agents): resnet50_imagenet_v1, or a file of weights
+    config.camera.stage = "conv2"  # of the backbone: stem, conv2 or conv3, or deeper where the file goes deeper
     config.camera.missing = -1  # the camera that sees nothing; -1: none
 
     config.map = ml_collections.ConfigDict()
@@ -122,6 +124,7 @@ def _enlarge(config) -> None:
     config.model.width = 64
     config.model.multi_action = False
     config.model.max_height = True
+    config.camera.backbone = "resnet50_imagenet_v1"
     config.optim.schedule = "constant"
     config.optim.learning_rate = 1e-4
     config.optim.weight_decay = 0.0

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from lala_jax import types
+from lala_jax import backbone, types
 from lala_jax.perception import calibration, noise, topdown
 from lala_jax.sim import distance, render, scene
 from lala_jax.sim.tasks import base
@@ -40,6 +40,8 @@ class Observer:
     turn: float = 0.0  # degrees, at most, that they are turned
     calibrate: bool = False  # find out where they are from the first pictures of an episode
     missing: int = -1  # the camera that sees nothing, -1 for none
+    backbone: str = ""  # pretrained features of the views to fuse over the surface: a name or a file for `backbone.load`; "" for none
+    stage: str = "conv2"  # of the backbone
 
     @property
     def camera(self) -> types.Camera:
@@ -95,7 +97,25 @@ class Observer:
         views = self.look(size, color, base, poses, key=key, layer=None if rig is None else rig.background)
         if rig is not None:
             views = views.replace(camera=rig.believed)
-        return topdown.from_views_batch(views, spec=self.spec)
+        return self.fuse(views)
+
+    def fuse(self, views: types.Views) -> types.TopDownMap:
+        """Fuse the views of B scenes (leaves `[B, V, ...]`), with their pretrained features where the observer has a backbone.
+
+        The features of each pixel are scaled to a root mean square of one before they are fused.
+        """
+        maps = topdown.from_views_batch(views, spec=self.spec)
+        if not self.backbone:
+            return maps
+
+        module, variables = _load(self.backbone, self.stage)
+
+        def one(views):
+            features = jnp.asarray(module.apply(variables, views.rgb))
+            features *= jax.lax.rsqrt(jnp.square(features).mean(-1, keepdims=True) + 1e-6)
+            return topdown.surface_features(views, features, spec=self.spec)
+
+        return maps.replace(surface=jax.lax.map(one, views))
 
     def mount(self, key: jax.Array, size: jax.Array, color: jax.Array, base: jax.Array, poses: jax.Array) -> Rig:
         """Put up the cameras of E episodes: move them, and calibrate them on the pictures of the first `poses` `[E, N, 7]`."""
@@ -121,6 +141,9 @@ class Observer:
     def check(self) -> None:
         """Raise ValueError naming the first camera of the preset that sees nothing of the table or the arm."""
         render.check_views(self.background())
+
+
+_load = functools.lru_cache(maxsize=2)(lambda name, stage: backbone.load(name, stage=stage))
 
 
 @functools.cache

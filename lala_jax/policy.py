@@ -35,7 +35,7 @@ class Heatmaps:
     place: jax.Array  # [k, rows, cols] logits
 
 
-def empty_map(spec: types.MapSpec, *, features: int = 3) -> types.TopDownMap:
+def empty_map(spec: types.MapSpec, *, features: int = 3, surface: int = 0) -> types.TopDownMap:
     """Give a map in which nothing was seen."""
     grid = (spec.rows, spec.cols, spec.slices)
     return types.TopDownMap(
@@ -44,6 +44,7 @@ def empty_map(spec: types.MapSpec, *, features: int = 3) -> types.TopDownMap:
         offset=jnp.zeros((*grid, 2)),
         height=jnp.zeros(grid[:2]),
         skin=jnp.zeros((*grid[:2], 2)),
+        surface=jnp.zeros((*grid[:2], surface)) if surface else None,
     )
 
 
@@ -308,17 +309,19 @@ class TransporterPolicy:
     spec: types.MapSpec
     multi_action: bool = False
     max_height: bool = True
+    surface: int = 0  # channels of the map's features of the surface
     privileged: ClassVar[bool] = False
 
     def init(self, key: jax.Array):
         """Make the parameters."""
-        blank = self._input(empty_map(self.spec))
+        blank = self._input(empty_map(self.spec, surface=self.surface))
         return self.model.init(key, blank, blank, jnp.zeros(2, jnp.int32))["params"]
 
     def _input(self, topdown_map):
         if self.max_height:
             return transporter.normalise(topdown.max_height(topdown_map))
-        return transporter.normalise_slices(topdown_map.features[..., :3], topdown_map.count > 0, topdown_map.height)
+        slices = transporter.normalise_slices(topdown_map.features[..., :3], topdown_map.count > 0, topdown_map.height)
+        return slices if topdown_map.surface is None else jnp.concatenate([slices, topdown_map.surface], axis=-1)
 
     def loss(self, params, key: jax.Array, state: types.State, current: types.TopDownMap, goal: types.TopDownMap):
         """Give `(loss, metrics)` of one example: cross-entropy of pick and place (eqs. 4-6)."""

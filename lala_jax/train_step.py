@@ -11,7 +11,6 @@ import numpy as np
 import optax
 
 from lala_jax import augment, observe, policy, state, types
-from lala_jax.perception import topdown
 from lala_jax.sim.tasks import base
 
 
@@ -60,7 +59,7 @@ def observations(recipe: Recipe, key: jax.Array, examples: types.State) -> tuple
             return augment.sensors(key, key_noise, one, recipe.sensors, disparity=observer.disparity)
 
         views = jax.vmap(err)(jnp.concatenate([pair, pair]), jax.random.split(key_noise, 2 * size), views)
-    maps = topdown.from_views_batch(views, spec=observer.spec)
+    maps = observer.fuse(views)
     return jax.tree.map(lambda x: x[:size], maps), jax.tree.map(lambda x: x[size:], maps)
 
 

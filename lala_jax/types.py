@@ -117,6 +117,7 @@ class TopDownMap:
     offset: jax.Array  # [rows, cols, slices, 2] mean (row, col) of these points less the cell's centre, in cells; 0 where none fell
     height: jax.Array  # [rows, cols] metres above z_min of the highest point seen, 0 where none fell
     skin: jax.Array  # [rows, cols, 2] mean (row, col), likewise, of the points just under the highest: how far the top face fills the cell
+    surface: jax.Array | None = None  # [rows, cols, F] pretrained features of what is highest, mean over the views; 0 where none saw it
 
 
 @struct.dataclass

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lala_jax import build, defaults, losses, observe, options, types
+from lala_jax import backbone, build, defaults, losses, observe, options, types
 from lala_jax.perception import topdown
 from lala_jax.sim import render, scene, tasks
 
@@ -202,6 +202,38 @@ def test_the_map_of_found_cameras_is_that_of_cameras_that_did_not_move():
         assert both.mean() > 0.9
         assert (np.abs(still.height - mine.height)[both] < 0.002).mean() > 0.98
         assert (np.abs(still.height - deceived.height[index])[both] < 0.002).mean() < 0.5
+
+
+def test_pretrained_features_lie_where_they_were_seen():
+    """The same as fusing by hand what the trunk says of the views, scaled; nothing where no camera looked."""
+    plain, rich = (dataclasses.replace(TOWER, height=60, width=80, backbone=name, stage="stem") for name in ("", "resnet50_imagenet_v1"))
+    views = jax.jit(plain.look)(*cubes())
+    without, found = (jax.device_get(jax.jit(one.fuse)(views)) for one in (plain, rich))
+    assert without.surface is None and found.surface.shape == (2, SPEC.rows, SPEC.cols, 64)
+    np.testing.assert_array_equal(found.height, without.height)
+    module, variables = backbone.load("resnet50_imagenet_v1", stage="stem")
+    second = jax.tree.map(lambda leaf: leaf[1], views)
+    features = np.asarray(jax.jit(module.apply)(variables, second.rgb))
+    features = features / np.sqrt(np.square(features).mean(-1, keepdims=True) + 1e-6)
+    by_hand = jax.jit(topdown.surface_features, static_argnames="spec")(second, features, spec=SPEC)
+    np.testing.assert_allclose(found.surface[1], by_hand, atol=1e-3)
+    seen = without.count[1].sum(-1) > 0
+    assert np.array_equal(np.abs(found.surface[1]).sum(-1) > 0, seen) and 0.3 < seen.mean()
+
+
+def test_only_transporters_take_a_backbone():
+    config = options.override(defaults.get("", task="tower"), ["camera.backbone=resnet50_imagenet_v1"])
+    with pytest.raises(options.OptionsError, match="model.name 'goal_aware' takes no camera.backbone; those that do are single, "):
+        build.build_policy(config)
+    config = options.override(config, ["model.name=two_stream", "model.width=4", "model.max_height=true"])
+    for stage, channels in (("stem", 64), ("conv2", 256), ("conv3", 512)):
+        agent = build.build_policy(options.override(config, [f"camera.stage={stage}"]))
+        params = jax.eval_shape(agent.init, jax.random.key(0))
+        assert params["pick_net"]["goal"]["stem"]["kernel"].shape[2] == 3 + channels + 1
+    with pytest.raises(options.OptionsError, match="camera.stage must be one of 'stem', .*got 'conv6'"):
+        build.build_policy(options.override(config, ["camera.stage=conv6"]))
+    assert build.input_spec(config)["surface"] == "resnet50_imagenet_v1 conv2"
+    assert "surface" not in build.input_spec(defaults.get("", task="tower"))
 
 
 def test_a_missing_camera_must_be_there():

@@ -125,10 +125,11 @@ def surface_features(
     """Fuse per-view feature maps of any resolution into one map of the surface: LALA's feature fusion (section IV, figure 2).
 
     Each view gives a cell the feature, read bilinearly, of the highest point that it saw there; a cell's value is the mean over the
-    views that saw it, 0 where none did. Which points count is as in `fuse`. The order of the views does not matter.
+    views that saw it, 0 where none did. Which points count is as in `fuse`. The order of the views does not matter. Features at `1 / s`
+    of the image's sides are taken to be centred on every `s`-th pixel from the first, as strided convolutions leave them.
     """
     scale = np.array([features.shape[1] / views.depth.shape[1], features.shape[2] / views.depth.shape[2]], np.float32)
-    most = np.array(features.shape[1:3], np.float32) - 0.5  # beyond the outermost centres the outermost values hold
+    most = np.array(features.shape[1:3], np.float32) - 0.5  # past the outermost centres the outermost values hold
 
     def one(depth, camera, grid):
         points = cameras.unproject(depth, camera).reshape(-1, 3)
@@ -136,7 +137,7 @@ def surface_features(
         top = jnp.full(spec.rows * spec.cols, -jnp.inf).at[cell].max(height, **_DROP)
         highest = height >= top.at[cell].get(mode="fill", fill_value=jnp.inf)
         pixel = jnp.full(spec.rows * spec.cols, -1).at[jnp.where(highest, cell, spec.rows * spec.cols)].max(jnp.arange(len(cell)), **_DROP)
-        at = (jnp.stack([pixel // depth.shape[1], pixel % depth.shape[1]], axis=-1) + 0.5) * scale
+        at = jnp.stack([pixel // depth.shape[1], pixel % depth.shape[1]], axis=-1) * scale + 0.5
         seen = (pixel >= 0)[:, None]
         return jnp.where(seen, image.sample(grid, jnp.clip(at, 0.5, most)), 0.0), seen
 
@@ -145,8 +146,12 @@ def surface_features(
 
 
 def max_height(topdown: types.TopDownMap) -> Float[Array, "rows cols channels"]:
-    """Give what is seen from above, `[rows, cols, C + 1]`: each cell's features in its highest seen slice, then its height in metres."""
-    return jnp.concatenate([highest(topdown.features, topdown.count > 0), topdown.height[..., None]], axis=-1)
+    """Give what is seen from above, `[rows, cols, C + 1]`: each cell's features in its highest seen slice, then its height in metres.
+
+    Features of the surface, where the map has them, come between the two.
+    """
+    more = [] if topdown.surface is None else [topdown.surface]
+    return jnp.concatenate([highest(topdown.features, topdown.count > 0), *more, topdown.height[..., None]], axis=-1)
 
 
 def keep_highest(topdown: types.TopDownMap) -> types.TopDownMap:

@@ -270,9 +270,9 @@ def slow_surface(views, features):
             cell = int(np.floor((y - SPEC.y[0]) / SPEC.cell)), int(np.floor((x - SPEC.x[0]) / SPEC.cell))
             inside = 0 <= cell[0] < SPEC.rows and 0 <= cell[1] < SPEC.cols and -0.01 <= z < SPEC.z[1]
             if inside and z >= best.get(cell, (-1,))[0]:
-                best[cell] = z, (i + 0.5) / depth.shape[0] * grid.shape[0], (j + 0.5) / depth.shape[1] * grid.shape[1]
+                best[cell] = z, i / depth.shape[0] * grid.shape[0], j / depth.shape[1] * grid.shape[1]
         for cell, (_, row, col) in best.items():
-            row, col = (np.clip(at - 0.5, 0, n - 1) for at, n in ((row, grid.shape[0]), (col, grid.shape[1])))
+            row, col = (np.clip(at, 0, n - 1) for at, n in ((row, grid.shape[0]), (col, grid.shape[1])))
             i, j = (min(int(at), n - 2) for at, n in ((row, grid.shape[0]), (col, grid.shape[1])))
             a, b = row - i, col - j
             above, below = ((1 - b) * grid[k, j] + b * grid[k, j + 1] for k in (i, i + 1))
