@@ -13,7 +13,7 @@ from lala_jax.models import goal_aware, transporter
 from lala_jax.sim import scene, tasks
 from lala_jax.sim.tasks import base
 
-MODELS = ("goal_aware", "single", "two_stream", "two_stream_lateral")
+MODELS = ("goal_aware", *transporter.VARIANTS)
 SPLITS = ("train", "val", "test")
 TEST_START = 10_001
 WORKDIR = "runs/<task>"  # the default of --workdir

@@ -43,7 +43,7 @@ def get(arg: str, *, task: str) -> ml_collections.ConfigDict:
     config.map.slices = 14
 
     config.model = ml_collections.ConfigDict()
-    config.model.name = "goal_aware"  # or single, two_stream, two_stream_lateral (the paper's)
+    config.model.name = "goal_aware"  # or single, two_stream, two_stream_lateral (the paper's), transporter, image_goal, goal_split
     config.model.rotations = 36
     config.model.crop = 24  # cells; 64 for the paper's at full resolution
     config.model.channels = 4  # of key and query

@@ -297,7 +297,7 @@ class GoalAwarePolicy:
 
 @dataclasses.dataclass(frozen=True)
 class TransporterPolicy:
-    """The paper's agents: `models.transporter` on max-height maps, one-hot labels unless `multi_action`."""
+    """The paper's agents and their rivals: `models.transporter` on max-height maps, one-hot labels unless `multi_action`."""
 
     model: transporter.Transporter
     spec: types.MapSpec

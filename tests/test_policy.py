@@ -27,7 +27,7 @@ POLICIES = {"goal_aware": policy.GoalAwarePolicy(model=GOAL_AWARE)} | {
     variant: policy.TransporterPolicy(
         model=transporter.Transporter(variant=variant, yaw_bins=ROTATIONS, crop=8, channels=2, width=4, stages=2), spec=SPEC
     )
-    for variant in ("single", "two_stream", "two_stream_lateral")
+    for variant in transporter.VARIANTS
 }
 
 

@@ -69,30 +69,33 @@ class ResNet43_8s(nn.Module):
         check_sides(x.shape, self.stages)
         x = nn.relu(nn.Conv(self.width, (3, 3), padding=1, dtype=self.dtype, name="stem")(x))
         for stage in range(self.stages):
-            x = self._pair(x, self.width << stage, f"down{stage}", stride=2 if stage else 1)
+            x = residual_pair(x, self.width << stage, f"down{stage}", stride=2 if stage else 1, dtype=self.dtype)
         decoded = []
         for level, stage in enumerate(reversed(range(self.stages - 1))):
-            x = upsample(self._pair(x, self.width << stage, f"up{stage}"))
+            x = upsample(residual_pair(x, self.width << stage, f"up{stage}", dtype=self.dtype))
             if laterals is not None:
                 x = jnp.concatenate([x, laterals[level].astype(x.dtype)], -1)
                 x = nn.Conv(self.width << stage, (1, 1), dtype=self.dtype, name=f"lateral{stage}")(x)
             decoded.append(x)
-        x = self._pair(x, max(self.width // 4, MIN_HEAD), "head", self.out, relus=(self.head_relu, False))
+        relus = (self.head_relu, False)
+        x = residual_pair(x, max(self.width // 4, MIN_HEAD), "head", self.out, relus=relus, dtype=self.dtype)
         return x, decoded
 
-    def _pair(
-        self,
-        x: jax.Array,
-        width: int,
-        name: str,
-        out: int | None = None,
-        *,
-        stride: int = 1,
-        relus: tuple[bool, bool] = (True, True),
-    ) -> jax.Array:
-        out = width if out is None else out
-        x = ResidualBlock(width, out, stride, True, relus[0], self.dtype, name=f"{name}_project")(x)
-        return ResidualBlock(width, out, 1, False, relus[1], self.dtype, name=f"{name}_identity")(x)
+
+def residual_pair(
+    x: jax.Array,
+    width: int,
+    name: str,
+    out: int | None = None,
+    *,
+    stride: int = 1,
+    relus: tuple[bool, bool] = (True, True),
+    dtype: jnp.dtype = jnp.float32,
+) -> jax.Array:
+    """Pass `[..., H, W, C]` through a projecting and an identity block of the module that calls, to `out` (or `width`) channels."""
+    out = width if out is None else out
+    x = ResidualBlock(width, out, stride, True, relus[0], dtype, name=f"{name}_project")(x)
+    return ResidualBlock(width, out, 1, False, relus[1], dtype, name=f"{name}_identity")(x)
 
 
 def check_sides(shape: Sequence[int], stages: int) -> None:

@@ -1,4 +1,4 @@
-"""The paper's policy: pick map, query of rotated crops about the pick, key map, and their correlation.
+"""The paper's policy and its rivals: pick map, query of rotated crops about the pick, key map, and their correlation.
 
 The rotation and the correlation have no parameters and are plain functions; the module only composes them. As in the
 paper, the query sees the goal image *at the pick cell*, which in these tasks is bare table once the goal is reached.
@@ -11,8 +11,10 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from lala_jax.models import correlation, streams
+from lala_jax.models import blocks, correlation, streams
 from lala_jax.perception import image
+
+VARIANTS = (*streams.VARIANTS, "transporter", "image_goal", "goal_split")
 
 # CLIPort's constants for a tabletop: colours in 0..1, heights in metres.
 COLOR_MEAN, COLOR_STD = 0.18877631, 0.07276466
@@ -50,7 +52,16 @@ def place_logits(
 
 
 class Transporter(nn.Module):
-    """Goal-conditioned Transporter (LALA) in its three variants; unbatched, float32 logits.
+    """Goal-conditioned Transporter: LALA in its three variants, and what it is compared with; unbatched, float32 logits.
+
+    Of pick, key and query net, those of `streams.VARIANTS` (LALA) each take both images. The others are one hourglass each,
+    and one more for the goal, `g`, where there is one:
+
+    - "transporter" ignores the goal: Transporter Networks, the control.
+    - "image_goal" picks from `pick(current * goal)`, and adds: `key(current) + g(goal)`, `query(crops) + g(goal crops)`
+      (CLIPort, `AttentionImageGoal` and `TransportImageGoal`). Its product is of raw images, ours of what we are given.
+    - "goal_split" picks without the goal and multiplies: `key(current) * g(goal)`, and `query(current) * g(goal)` of the whole
+      map, of which the crops are cut (Ravens, `TransportGoal`; its hourglass also has biases, and strides in the first 1x1).
 
     The defaults are the paper's: 64 x 64 crops, 36 rotations, three channels of key and query. A smaller `width`,
     `stages` and `crop` make a compact one. Raises ValueError for an unknown `variant`, for a crop that the strides do
@@ -58,7 +69,7 @@ class Transporter(nn.Module):
     compiling the default kind for a CPU takes most of a second for every tensor.
     """
 
-    variant: str = "two_stream"  # one of streams.VARIANTS
+    variant: str = "two_stream"  # one of VARIANTS
     yaw_bins: int = 36
     crop: int = 64  # cells
     channels: int = 3  # of key and query
@@ -68,7 +79,7 @@ class Transporter(nn.Module):
     dtype: jnp.dtype = jnp.float32  # what the networks compute in
 
     def __post_init__(self):
-        for name, valid in (("variant", streams.VARIANTS), ("method", correlation.METHODS)):
+        for name, valid in (("variant", VARIANTS), ("method", correlation.METHODS)):
             if getattr(self, name) not in valid:
                 raise ValueError(f"Transporter.{name} must be one of {valid}, got {getattr(self, name)!r}")
         step = 2 ** (self.stages - 1)
@@ -79,12 +90,16 @@ class Transporter(nn.Module):
         super().__post_init__()
 
     def setup(self):
-        self.pick_net = self._streams(1, "add")
-        self.key_net = self._streams(self.channels, "conv")
-        self.query_net = self._streams(self.channels, "conv")
+        self.pick_net = self._net(1, "add")
+        self.key_net = self._net(self.channels, "conv")
+        self.query_net = self._net(self.channels, "conv")
+        if self.variant in ("image_goal", "goal_split"):
+            self.goal_net = self._net(self.channels, "conv")
 
-    def _streams(self, out: int, fusion: str) -> streams.Streams:
-        return streams.Streams(out, self.variant, fusion, self.width, self.stages, self.dtype)
+    def _net(self, out: int, fusion: str) -> nn.Module:
+        if self.variant in streams.VARIANTS:
+            return streams.Streams(out, self.variant, fusion, self.width, self.stages, self.dtype)
+        return blocks.ResNet43_8s(out, self.width, self.stages, self.dtype)
 
     def __call__(
         self, current: Float[Array, "rows cols c"], goal: Float[Array, "rows cols c"], pick_cell: Int[ArrayLike, 2] | None = None
@@ -105,31 +120,57 @@ class Transporter(nn.Module):
         rows, cols = current.shape[:2]
         side = self._round_up(max(rows, cols))
         top, left = (side - rows) // 2, (side - cols) // 2
-        logits = self.pick_net(*(_pad(x, (top, side - rows - top), (left, side - cols - left)) for x in (current, goal)))
+        pads = (top, side - rows - top), (left, side - cols - left)
+        current, goal = _pad(current, *pads), _pad(goal, *pads)
+        if self.variant in streams.VARIANTS:
+            logits = self.pick_net(current, goal)
+        else:
+            logits = self._alone(self.pick_net, current * goal if self.variant == "image_goal" else current)
         return logits[top : top + rows, left : left + cols, 0]
 
     def place(
         self, current: Float[Array, "rows cols c"], goal: Float[Array, "rows cols c"], pick_cell: Int[Array, 2]
     ) -> tuple[Float[Array, "k rows cols"], dict[str, jax.Array]]:
         """Score every place of what is at `pick_cell`: `([yaw_bins, rows, cols], intermediates)`."""
-        maps = pick_crops(jnp.concatenate([current, goal], -1), pick_cell, yaw_bins=self.yaw_bins, crop=self.crop)
-        query = self.query(*jnp.split(maps, 2, axis=-1))
-        key = self.key(current, goal)
+        turns = {"yaw_bins": self.yaw_bins, "crop": self.crop}
+        if self.variant == "goal_split":
+            key, features = self._on_map(current, goal, self.key_net, self.query_net)
+            query = pick_crops(features, pick_cell + self.crop // 2, **turns)
+        else:
+            maps = pick_crops(jnp.concatenate([current, goal], -1), pick_cell, **turns)
+            query = self.query(*jnp.split(maps, 2, axis=-1))
+            key = self.key(current, goal)
         scale = self.crop**-2 * self.channels**-0.5
         logits = place_logits(key, query, scale=scale, method=self.method)
         return logits, {"pick_cell": pick_cell, "key": key, "query": query}
 
     def key(self, current: Float[Array, "rows cols c"], goal: Float[Array, "rows cols c"]) -> Float[Array, "padded_rows padded_cols d"]:
         """Give the key map, `crop // 2` cells larger on each side so that places at the border see whole kernels."""
+        return self._on_map(current, goal, self.key_net)[0]
+
+    def query(self, current: Float[Array, "... rows cols c"], goal: Float[Array, "... rows cols c"]) -> Float[Array, "... rows cols d"]:
+        """Give the query features of both images: kernels of rotated crops, or for "goal_split" what kernels are cut of."""
+        return self._features(current, goal, self.query_net)[0]
+
+    def _on_map(self, current: jax.Array, goal: jax.Array, *nets: nn.Module) -> list[jax.Array]:
+        """Give each net's features of the maps with `crop // 2` cells of zeros on each side."""
         rows, cols = current.shape[:2]
         margin = self.crop // 2
         extra = self._round_up(rows) - rows, self._round_up(cols) - cols
-        key = self.key_net(*(_pad(x, (margin, margin + extra[0]), (margin, margin + extra[1])) for x in (current, goal)))
-        return key[: rows + 2 * margin, : cols + 2 * margin]
+        padded = (_pad(x, (margin, margin + extra[0]), (margin, margin + extra[1])) for x in (current, goal))
+        return [x[: rows + 2 * margin, : cols + 2 * margin] for x in self._features(*padded, *nets)]
 
-    def query(self, current: Float[Array, "k crop crop c"], goal: Float[Array, "k crop crop c"]) -> Float[Array, "k crop crop d"]:
-        """Give the query kernels of rotated crops of both maps."""
-        return self.query_net(current, goal)
+    def _features(self, current: jax.Array, goal: jax.Array, *nets: nn.Module) -> list[jax.Array]:
+        if self.variant in streams.VARIANTS:
+            return [net(current, goal) for net in nets]
+        own = [self._alone(net, current) for net in nets]
+        if self.variant == "transporter":
+            return own
+        goal = self._alone(self.goal_net, goal)
+        return [x + goal if self.variant == "image_goal" else x * goal for x in own]
+
+    def _alone(self, net: nn.Module, image: jax.Array) -> jax.Array:
+        return net(image)[0].astype(jnp.float32)
 
     def _round_up(self, cells: int) -> int:
         step = 2 ** (self.stages - 1)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import reference
 
 from lala_jax.models import transporter
 
@@ -14,6 +15,12 @@ SMALL = {"yaw_bins": 4, "crop": 8, "width": 8, "stages": 2}
 
 def _maps(rows=12, cols=8, channels=4):
     return jax.random.normal(jax.random.key(0), (2, rows, cols, channels))
+
+
+def _drawn(net, *maps):
+    """Parameters that keep a picture's size through ReLUs, biases too, drawn by numpy."""
+    rng, shapes = np.random.default_rng(0), jax.eval_shape(net.init, jax.random.key(0), *maps)
+    return jax.tree.map(lambda s: rng.normal(0, (2 / max(np.prod(s.shape[:-1]), 8)) ** 0.5, s.shape).astype(np.float32), shapes)
 
 
 def _built(rows=12, cols=8, **options):
@@ -35,7 +42,110 @@ def test_paper_size(variant, parameters):
     assert intermediates["key"].shape == (384, 224, 3) and intermediates["query"].shape == (36, 64, 64, 3)
 
 
-@pytest.mark.parametrize("variant", ["single", "two_stream_lateral"])  # the latter holds every part of two_stream
+def _public_hourglass(channels, out, *, biases):
+    """Add up `ResNet43_8s`, with biases as in Ravens or only the first layer's as in CLIPort."""
+    total, before = 9 * channels * 64 + 64, 64
+    for width, last in ((64, 64), (128, 128), (256, 256), (512, 512), (256, 256), (128, 128), (64, 64), (16, out)):
+        for shortcut, entering in ((True, before), (False, last)):
+            total += entering * width + 9 * width * width + width * last + shortcut * entering * last
+            total += biases * (2 * width + last + shortcut * last)
+        before = last
+    return total
+
+
+@pytest.mark.parametrize(
+    "variant, goal_nets, public, biases",
+    [
+        ("transporter", 0, 29_470_288, 0),  # CLIPort's OriginalTransporterAgent: attn_stream, key_resnet, query_resnet
+        ("image_goal", 1, 39_293_792, 0),  # CLIPort's ImageGoalTransporterAgent: the same and goal_resnet
+        ("goal_split", 1, 39_333_502, 39_710),  # Ravens' GoalTransporterAgent: Attention, s0_, s1_, s2_ of TransportGoal
+    ],
+)
+def test_rivals_have_the_public_parameters(variant, goal_nets, public, biases):
+    """Six channels, as colour and three times the height; what ours lack are Ravens' biases."""
+    counts = [_public_hourglass(6, out, biases=biases > 0) for out in (1, *[3] * (2 + goal_nets))]
+    assert sum(counts) == public
+    net = transporter.Transporter(variant)
+    image = jax.ShapeDtypeStruct((320, 160, 6), jnp.float32)
+    params = jax.eval_shape(net.init, jax.random.key(0), image, image)
+    assert sum(leaf.size for leaf in jax.tree.leaves(params)) == public - biases
+    logits, intermediates = jax.eval_shape(net.apply, params, image, image, jax.ShapeDtypeStruct((2,), jnp.int32))
+    assert logits["pick"].shape == (320, 160) and logits["place"].shape == (36, 320, 160)
+    assert intermediates["key"].shape == (384, 224, 3) and intermediates["query"].shape == (36, 64, 64, 3)
+
+
+@pytest.mark.parametrize("variant", ["transporter", "image_goal", "goal_split"])
+def test_rivals_equal_their_formulas_in_numpy(variant):
+    """From the maps to both logits on the same random weights, and a goal matters unless it is ignored."""
+    net = transporter.Transporter(variant, **(SMALL | {"width": 4}))
+    current, goal = np.asarray(_maps())
+    params, cell = _drawn(net, current, goal), (8, 2)
+    apply = jax.jit(net.apply)
+    logits, intermediates = apply(params, current, goal, jnp.array(cell))
+
+    def features(name, *maps):
+        return [reference.hourglass(params["params"][f"{name}_net"], one, 2) for one in maps]
+
+    square = [np.pad(one, ((0, 0), (2, 2), (0, 0))) for one in (current, goal)]
+    wide = [np.pad(one, ((4, 4), (4, 4), (0, 0))) for one in (current, goal)]
+    crops = [reference.quarter_crops(one, cell, 8) for one in (current, goal)]
+    if variant == "transporter":
+        (pick,), (key,), (query,) = features("pick", square[0]), features("key", wide[0]), features("query", crops[0])
+    if variant == "image_goal":
+        (pick,), (key,), (query,) = features("pick", square[0] * square[1]), features("key", wide[0]), features("query", crops[0])
+        more_key, more_query = features("goal", wide[1], crops[1])
+        key, query = key + more_key, query + more_query
+    if variant == "goal_split":
+        (pick,), (key,), (query,), (times,) = (
+            features(name, one) for name, one in (("pick", square[0]), ("key", wide[0]), ("query", wide[0]), ("goal", wide[1]))
+        )
+        key, query = key * times, reference.quarter_crops(query * times, (12, 6), 8)
+    np.testing.assert_allclose(logits["pick"], pick[:, 2:-2, 0], atol=1e-4)
+    np.testing.assert_allclose(intermediates["key"], key, atol=1e-4)
+    np.testing.assert_allclose(intermediates["query"], query, atol=1e-4)
+    place = reference.places(key, query) / 8**2 / 3**0.5
+    np.testing.assert_allclose(logits["place"], place, atol=1e-3 * place.std())
+    again, _ = apply(params, current, goal[::-1], jnp.array(cell))
+    assert np.array_equal(again["place"], logits["place"]) == (variant == "transporter")
+    assert np.array_equal(again["pick"], logits["pick"]) == (variant != "image_goal")
+
+
+@pytest.mark.parametrize("variant", ["transporter", "image_goal", "goal_split"])
+def test_turning_both_maps_by_a_bin_turns_picks_and_places(variant):
+    """With networks that look at single cells the law is exact: all turns about z, and what a held thing is turned by stays."""
+    net = transporter.Transporter(variant, **(SMALL | {"crop": 9, "width": 4, "stages": 1}))
+    maps = np.asarray(_maps(15, 15))
+    params = _drawn(net, *maps)
+    centre = np.zeros((3, 3, 1, 1), np.float32)
+    centre[1, 1] = 3.0
+    params = jax.tree.map(lambda leaf: leaf * centre if leaf.shape[:2] == (3, 3) else leaf, params)
+    apply = jax.jit(net.apply)
+    logits, _ = apply(params, *maps, jnp.array([6, 9]))
+    turned, _ = apply(params, *np.swapaxes(maps[:, ::-1], 1, 2), jnp.array([9, 14 - 6]))  # (row, col) goes to (col, -row)
+    np.testing.assert_allclose(turned["pick"], logits["pick"][::-1].T, atol=1e-4)
+    expected = np.swapaxes(logits["place"][:, ::-1], 1, 2)
+    np.testing.assert_allclose(turned["place"], expected, atol=1e-3 * expected.std())
+    assert not np.allclose(turned["place"], np.roll(expected, 1, axis=0), atol=expected.std())
+
+
+def test_key_and_query_alone_are_those_of_place():
+    """What "goal_split" cuts its kernels of is the query of the padded maps."""
+    net = transporter.Transporter("goal_split", **(SMALL | {"width": 4, "stages": 1}))
+    maps = np.asarray(_maps())
+    params, cell = _drawn(net, *maps), jnp.array([3, 5])
+
+    @jax.jit
+    def both(params, current, goal):
+        bound, wide = net.bind(params), [jnp.pad(one, ((4, 4), (4, 4), (0, 0))) for one in (current, goal)]
+        cut = transporter.pick_crops(bound.query(*wide), cell + 4, yaw_bins=4, crop=8)
+        return bound.place(current, goal, cell)[1], bound.key(current, goal), cut
+
+    intermediates, key, query = both(params, *maps)
+    np.testing.assert_allclose(intermediates["key"], key, atol=1e-5)
+    np.testing.assert_allclose(intermediates["query"], query, atol=1e-5)
+
+
+@pytest.mark.parametrize("variant", ["single", "two_stream_lateral", "goal_split"])  # the second holds every part of two_stream
 def test_learns_everywhere_and_starts_near_zero(variant):
     net, params, current, goal = _built(variant=variant, stages=2 if variant == "two_stream_lateral" else 1)
 

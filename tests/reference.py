@@ -1,0 +1,70 @@
+"""Slow and obvious NumPy versions of what the networks are made of, on the parameters of one Flax module, in float64."""
+
+import numpy as np
+
+
+def conv(x, leaf, stride=1):
+    """Convolve `[..., H, W, C]`, tap by tap, with half the kernel of zeros around; `leaf` has a kernel and perhaps a bias."""
+    kernel = np.asarray(leaf["kernel"], np.float64)
+    half, (rows, cols) = len(kernel) // 2, x.shape[-3:-1]
+    padded = np.pad(x, [(0, 0)] * (x.ndim - 3) + [(half, half), (half, half), (0, 0)])
+    out = 0.0
+    for i, j in np.ndindex(kernel.shape[:2]):
+        out = out + padded[..., i : i + rows : stride, j : j + cols : stride, :] @ kernel[i, j]
+    return out + np.asarray(leaf["bias"], np.float64) if "bias" in leaf else out
+
+
+def relu(x):
+    """Cut at zero."""
+    return np.maximum(x, 0)
+
+
+def upsample(x):
+    """Double the sides of `[..., H, W, C]`: even cells copy, odd ones interpolate, the last repeats."""
+    for axis in (-3, -2):
+        size = x.shape[axis]
+        x = np.apply_along_axis(lambda line, size=size: np.interp(np.arange(2 * size) / 2, np.arange(size), line), axis, x)
+    return x
+
+
+def pair(params, name, x, stride=1, last_relu=True):
+    """Pass the projecting and the identity block of this name."""
+    for kind, step in (("project", stride), ("identity", 1)):
+        leaf = params[f"{name}_{kind}"]
+        y = relu(conv(relu(conv(x, leaf["reduce"])), leaf["middle"], step))
+        x = conv(y, leaf["expand"]) + (conv(x, leaf["shortcut"], step) if kind == "project" else x)
+        x = relu(x) if last_relu else x
+    return x
+
+
+def hourglass(params, x, stages):
+    """Pass a `blocks.ResNet43_8s`."""
+    x = relu(conv(np.asarray(x, np.float64), params["stem"]))
+    for stage in range(stages):
+        x = pair(params, f"down{stage}", x, 2 if stage else 1)
+    for stage in reversed(range(stages - 1)):
+        x = upsample(pair(params, f"up{stage}", x))
+    return pair(params, "head", x, last_relu=False)
+
+
+def quarter_crops(x, cell, crop):
+    """Cut four crops of `[H, W, C]` about a cell, turned by quarters: row is y, col is x, zero outside."""
+    out = np.zeros((4, crop, crop, x.shape[-1]))
+    for turn, i, j in np.ndindex(out.shape[:3]):
+        y, x_ = i - crop // 2, j - crop // 2
+        for _ in range(turn):  # what is read lies a turn back
+            y, x_ = -x_, y
+        row, col = cell[0] + y, cell[1] + x_
+        if 0 <= row < x.shape[0] and 0 <= col < x.shape[1]:
+            out[turn, i, j] = x[row, col]
+    return out
+
+
+def places(key, query):
+    """Correlate a map padded by half the crops with the crops, window by window: `[k, H, W]`."""
+    crop = query.shape[1]
+    rows, cols = key.shape[0] - 2 * (crop // 2), key.shape[1] - 2 * (crop // 2)
+    out = np.zeros((len(query), rows, cols))
+    for i, j in np.ndindex(rows, cols):
+        out[:, i, j] = np.einsum("abd,kabd->k", key[i : i + crop, j : j + crop], query)
+    return out
