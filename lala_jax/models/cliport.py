@@ -17,7 +17,7 @@ import numpy as np
 from flax import linen as nn
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from lala_jax.models import blocks, correlation, transporter
+from lala_jax.models import blocks, correlation, streams, transporter
 from lala_jax.perception import image
 
 
@@ -104,13 +104,21 @@ class SemanticStream(nn.Module):
 
 
 class TwoStream(nn.Module):
-    """Both streams and their sum, as CLIPort picks, or ("conv") a ReLU and a 1x1 convolution of both, as its key and query."""
+    """Both streams, and their sum ("add", CLIPort's pick) or a 1x1 convolution of both behind a ReLU ("conv", its key and query).
+
+    Raises ValueError for another fusion.
+    """
 
     out: int
     fusion: str
     width: int = 64
     stages: int = 5
     dtype: jnp.dtype = jnp.float32
+
+    def __post_init__(self):
+        if self.fusion not in streams.FUSIONS:
+            raise ValueError(f"TwoStream.fusion must be one of {streams.FUSIONS}, got {self.fusion!r}")
+        super().__post_init__()
 
     @nn.compact
     def __call__(self, maps: jax.Array, features: Sequence[jax.Array], sentence: jax.Array) -> jax.Array:
@@ -128,8 +136,9 @@ class Cliport(nn.Module):
 
     `maps` `[rows, cols, c]` is a max-height map as `transporter.normalise` gives it. `features` are a frozen backbone's of
     its colours, `[rows / s, cols / s, c_s]`, fine to coarse, each stride twice the one before: two or more. Feature `[i, j]`
-    lies over cell `[s * i, s * j]`, as padded strided convolutions put it. `sentence` `[e]` is a frozen encoder's. CLIPort's own
-    are ResNet-50's at strides 4, 8, 16 and 32 with 256 to 2048 channels, and DistilBERT's mean of 768.
+    lies over cell `[s * i, s * j]`, as padded strided convolutions put it. `sentence` `[e]` is a frozen encoder's, with entries of
+    about one: what it says is multiplied in, so an embedding of length one (MiniLM's) times `sqrt(e)`, or it is hardly heard.
+    CLIPort's own are ResNet-50's at strides 4, 8, 16 and 32 with 256 to 2048 channels, and DistilBERT's mean of 768.
 
     CLIPort pads a map's picture before the backbone sees it, here its features are padded. Raises ValueError for an unknown
     `method`, for fewer than one rotation, for a crop that the strides do not divide, for features that are not as above, and

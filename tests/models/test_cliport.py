@@ -219,3 +219,8 @@ def test_refuses_what_does_not_fit(options, strides, message):
     maps, features, sentence = _inputs(24, 24, strides)
     with pytest.raises(ValueError, match=message):
         jax.eval_shape(cliport.Cliport(**(SMALL | options)).init, jax.random.key(0), maps, features, sentence)
+
+
+def test_refuses_an_unknown_fusion():
+    with pytest.raises(ValueError, match=r"fusion must be one of \('add', 'conv'\), got 'mean'"):
+        cliport.TwoStream(1, "mean")
