@@ -11,8 +11,9 @@ import numpy as np
 import optax
 import pytest
 from test_scoring import drawn_params
+from test_train_step import tiny_config
 
-from lala_jax import policy, types
+from lala_jax import build, policy, types
 from lala_jax.models import goal_aware, graph, transporter
 from lala_jax.perception import topdown, transforms
 from lala_jax.sim import oracle, tasks
@@ -386,6 +387,13 @@ def batched_loss(agent):
 def batch_of(*examples):
     keys = jax.random.split(jax.random.key(2), len(examples))
     return keys, *jax.tree.map(lambda *leaves: jnp.stack(leaves), *examples)
+
+
+@pytest.mark.parametrize("name", build.MODELS)
+def test_every_model_is_built_by_its_name(name):
+    agent = build.build_policy(tiny_config(f"model.name={name}"))
+    assert isinstance(agent, policy.GoalAwarePolicy) if name == "goal_aware" else agent.model.variant == name
+    assert set(build.MODELS) == {*POLICIES, "graph"}
 
 
 @pytest.mark.parametrize("name", list(POLICIES)[1:])
