@@ -392,7 +392,8 @@ def batch_of(*examples):
 @pytest.mark.parametrize("name", build.MODELS)
 def test_every_model_is_built_by_its_name(name):
     agent = build.build_policy(tiny_config(f"model.name={name}"))
-    assert isinstance(agent, policy.GoalAwarePolicy) if name == "goal_aware" else agent.model.variant == name
+    kind = {"goal_aware": policy.GoalAwarePolicy, "graph": policy.GraphPolicy}.get(name, policy.TransporterPolicy)
+    assert isinstance(agent, kind) and getattr(agent.model, "variant", name) == name
     assert set(build.MODELS) == {*POLICIES, "graph"}
 
 
