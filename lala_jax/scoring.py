@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lala_jax import build, checkpoint, observe, options, pictures, policy, pretrained, rollout, types, writers
+from lala_jax import build, checkpoint, compiling, observe, options, pictures, policy, pretrained, rollout, types, writers
 from lala_jax.sim import oracle
 
 AGENTS = ("policy", *oracle.AGENTS)
@@ -32,7 +32,7 @@ def mount_batch(observer: observe.Observer, key: jax.Array, scenes: types.Scene)
     return observer.mount(key, scenes.size, scenes.color, scenes.base, scenes.start)
 
 
-@functools.partial(jax.jit, static_argnums=0)
+@functools.partial(compiling.jit, static_argnums=0)
 def act_batch(agent: policy.Policy, params: Any, scenes: types.Scene, poses: jax.Array, current: types.TopDownMap, goal: types.TopDownMap):
     """Act in B scenes, one after another: `(PickPlace, best pick and place logits)` with leaves `[B, ...]`.
 

@@ -18,9 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 from rich import progress
 
-from lala_jax import build, checkpoint, dataset, options, recording, scoring, state, train_step, types, writers
+from lala_jax import build, checkpoint, compiling, dataset, options, recording, scoring, state, train_step, types, writers
 
-step = jax.jit(train_step.train_step, static_argnums=0, donate_argnums=1)
+step = compiling.jit(train_step.train_step, static_argnums=0, donate_argnums=1)
 
 
 class NonFiniteError(RuntimeError):

@@ -1,0 +1,41 @@
+"""A strided convolution as an unstrided one over blocks of cells: the same numbers, and an input gradient without a dilated kernel."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+
+def conv(lhs: jax.Array, rhs: jax.Array, window_strides: Sequence[int], padding: str, **kwargs: Any) -> jax.Array:
+    """Stand in for `jax.lax.conv_general_dilated` in `flax.linen.Conv(conv_general_dilated=...)`.
+
+    Maps `lhs` `[B, H, W, C]` and `rhs` `[kh, kw, C, O]` to `[B, H / sh, W / sw, O]`. Every block of the strides' size becomes one cell
+    with its inputs as channels (space to depth), and the kernel, filled up with zeros to whole blocks, goes over these. That is up to 44%
+    more work forward (5x5 with stride 2), and backward it spares XLA's convolution with a dilated input, several times slower on a CPU.
+
+    Raises ValueError unless the padding is "SAME", the strides divide the sides and nothing is dilated or grouped.
+    """
+    batch, *sides, channels = lhs.shape
+    dilated = [name for name in ("lhs_dilation", "rhs_dilation") if any(step != 1 for step in kwargs.pop(name, None) or ())]
+    if padding != "SAME" or dilated or kwargs.pop("feature_group_count", 1) != 1:
+        raise ValueError(f"needs padding SAME without dilation or groups, got padding {padding!r} and {dilated or 'groups'}")
+    if any(side % step for side, step in zip(sides, window_strides, strict=True)):
+        raise ValueError(f"strides {tuple(window_strides)} must divide the sides {tuple(sides)}")
+    pads, room, blocks = [], [], []
+    for size, step in zip(rhs.shape[:2], window_strides, strict=True):
+        low = max(size - step, 0) // 2  # cells before the first output's block that its window covers
+        before = -(-low // step)
+        front = before * step - low
+        count = -(-(front + size) // step)
+        blocks.append(count)
+        room.append((front, count * step - front - size))
+        pads.append((before, count - 1 - before))
+    (rows, cols), (down, right) = sides, window_strides
+    kernel = jnp.pad(rhs, (*room, (0, 0), (0, 0))).reshape(blocks[0], down, blocks[1], right, channels, -1)
+    kernel = kernel.transpose(0, 2, 1, 3, 4, 5).reshape(*blocks, down * right * channels, -1)
+    cells = lhs.reshape(batch, rows // down, down, cols // right, right, channels).transpose(0, 1, 3, 2, 4, 5)
+    cells = cells.reshape(batch, rows // down, cols // right, -1)
+    return jax.lax.conv_general_dilated(cells, kernel, (1, 1), pads, **kwargs)

@@ -1,0 +1,65 @@
+"""A strided convolution over blocks of cells against XLA's own, and its gradients."""
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from lala_jax.models import strided
+
+NUMBERS = ("NHWC", "HWIO", "NHWC")
+
+
+def plain(x, kernel, strides):
+    return jax.lax.conv_general_dilated(x, kernel, strides, "SAME", dimension_numbers=NUMBERS)
+
+
+@pytest.mark.parametrize("strides", [(1, 1), (2, 2), (3, 2), (4, 4)])
+@pytest.mark.parametrize("size", [1, 2, 3, 5, 8])
+def test_values_and_gradients_are_those_of_the_strided_convolution(strides, size):
+    rng = np.random.default_rng(size)
+    x = jnp.asarray(rng.normal(size=(2, 12, 24, 3)), jnp.float32)
+    kernel = jnp.asarray(rng.normal(size=(size, max(size - 1, 1), 3, 4)), jnp.float32)
+
+    def ours(x, kernel):
+        return strided.conv(x, kernel, strides, "SAME", dimension_numbers=NUMBERS)
+
+    got, back = jax.vjp(ours, x, kernel)
+    want, want_back = jax.vjp(lambda x, kernel: plain(x, kernel, strides), x, kernel)
+    assert got.shape == want.shape == (2, 12 // strides[0], 24 // strides[1], 4)
+    np.testing.assert_allclose(got, want, atol=1e-4)
+    slope = jnp.asarray(rng.normal(size=want.shape), jnp.float32)
+    for mine, theirs in zip(back(slope), want_back(slope), strict=True):
+        np.testing.assert_allclose(mine, theirs, atol=2e-4)
+
+
+def test_it_stands_in_in_flax_with_the_same_parameters():
+    x = jax.random.normal(jax.random.key(0), (2, 8, 8, 3))
+    layer = nn.Conv(4, (5, 5), strides=(2, 2))
+    params = layer.init(jax.random.key(1), x)
+    got = nn.Conv(4, (5, 5), strides=(2, 2), conv_general_dilated=strided.conv).apply(params, x)
+    np.testing.assert_allclose(got, layer.apply(params, x), atol=1e-5)
+
+
+def test_nothing_is_dilated_backward():
+    kernel = jnp.zeros((5, 5, 3, 4))
+    text = jax.jit(jax.grad(lambda x: strided.conv(x, kernel, (2, 2), "SAME", dimension_numbers=NUMBERS).sum()))
+    assert "lhs_dilate = [2, 2]" not in text.lower(jnp.zeros((1, 8, 8, 3))).as_text()
+    reference = jax.jit(jax.grad(lambda x: plain(x, kernel, (2, 2)).sum()))
+    assert "lhs_dilate = [2, 2]" in reference.lower(jnp.zeros((1, 8, 8, 3))).as_text()
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"padding": "VALID"}, "padding 'VALID'"),
+        ({"rhs_dilation": (2, 2)}, "rhs_dilation"),
+        ({"feature_group_count": 3}, "groups"),
+        ({"window_strides": (2, 3)}, r"strides \(2, 3\) must divide the sides \(8, 8\)"),
+    ],
+)
+def test_what_it_cannot_do_is_refused(change, message):
+    how = {"window_strides": (2, 2), "padding": "SAME", "dimension_numbers": NUMBERS} | change
+    with pytest.raises(ValueError, match=message):
+        strided.conv(jnp.zeros((1, 8, 8, 3)), jnp.zeros((3, 3, 3, 4)), **how)
