@@ -4,11 +4,12 @@ import json
 
 import numpy as np
 import pytest
+from PIL import Image
 from test_rollout import constant, run
 from test_scoring import SINGLE, save
 from test_train_step import tiny_config
 
-from experiments import ablation, common, main_table, robustness
+from experiments import ablation, common, main_table, robustness, table1
 from lala_jax import build, observe, options, rollout, train, writers
 from lala_jax.sim import tasks
 
@@ -45,6 +46,22 @@ def test_the_runs_of_the_main_table_build(unseen):
     configs = [row.configs(shipped("tower"))[0] for row in rows]
     assert [(config.data.demos, config.seed) for config in configs] == [(500, 0), (500, 1), (500, 2), (50, 0), (10, 0)]
     assert all(build.recipe(config).batch_size == 8 for config in configs)
+
+
+@pytest.mark.parametrize("scale", table1.SCALES)
+@pytest.mark.parametrize("task", tasks.names())
+def test_every_row_of_the_table_builds(task, scale, unseen):
+    base = options.override(shipped(task), table1.shared(shipped(task), scale))
+    rows, agents = table1.plan(scale), set()
+    assert len({row.name for row in rows}) == len({row.label for row in rows}) == len(rows)
+    for row in rows:
+        config = row.configs(base)[0]
+        if row.agent == "policy":
+            agents.add(build.recipe(config))
+            assert config.data.demos == base.data.demos and config.seed == base.seed
+    assert len(agents) == sum(row.agent == "policy" for row in rows)  # no row is another one's double
+    samples = {config.train.steps * config.train.batch_size for config in (row.configs(base)[0] for row in rows)}
+    assert scale == "smoke" or len(samples - {shipped(task).train.steps * 8}) == 1
 
 
 def test_rows_are_chosen_by_name():
@@ -232,6 +249,51 @@ def test_the_main_table_averages_over_seeds(trains, tmp_path, capsys):
     assert len(main_table.command(given)) == 3 and len(trains) == 3
 
 
+def test_the_table_holds_every_row_of_both_tasks(trains, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(table1.scoring, "baseline", lambda name, task, *, seeds, threads: told(seeds, {"blind": 20.0}.get(name, 40.0)))
+    given = ["--scale=smoke", f"--workdir={tmp_path / 'runs' / '<task>'}", f"--out={tmp_path}"]
+    rows = table1.command([*given, "--task=pallet", "--rows=blind,top_view,graph"])
+    assert [name for name, _ in trains] == [str(tmp_path / "runs/pallet" / f"smoke-{name}") for name in ("ours", "graph")]
+    assert [row["name"] for row in rows] == ["ours", "graph", "blind", "top_view"] and rows[2]["samples"] == 0
+    assert rows[0]["samples"] == 4 and rows[0]["train_seconds"] == 4 and rows[0]["parameters"] > 1000
+    table1.command([*given, "--rows=two-stream"])
+    config = trains[-1][1]
+    assert config.task.name == "tower" and config.model.max_height and not config.model.multi_action and config.camera.backbone
+    text = (tmp_path / "smoke.md").read_text()
+    assert text.strip() in capsys.readouterr().out
+    header, _, *lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines()]
+    assert header == ["", "parameters", "tower", "complete", "training, s", "published", "pallet", "complete", "training, s", "published"]
+    named = {line[0]: line[1:] for line in lines}
+    assert list(named) == [entry.label for entry in table1.ROWS if entry.name in ("ours", "two-stream", "graph", "blind", "top_view")]
+    assert named["LALA two stream"][4] == "15.8" and named["LALA two stream"][5:] == [""] * 4
+    assert named["blind: places well, ignores identities"][1:5] == [""] * 4  # of the tower it was not asked for
+    assert len(table1.command([*given, "--rows=two-stream"])) == 2 and len(trains) == 4  # nothing runs again
+
+
+def test_bars_are_as_long_as_the_scores(tmp_path):
+    def drawn(*scores):
+        rows = [{"score": score, "interval95": [None, None], "published": None} for score in scores]
+        table1.bars({"tower": dict(zip(("ours", "single"), rows, strict=False))}, tmp_path / "bars.webp")
+        pixels = np.asarray(Image.open(tmp_path / "bars.webp").convert("RGB")).astype(int)
+        return (np.abs(pixels - (31, 119, 180)).max(-1) < 40).sum()
+
+    assert drawn(80.0, 80.0) == pytest.approx(2 * drawn(40.0, 40.0), rel=0.05)
+    assert drawn(80.0, 0.0) == pytest.approx(drawn(40.0, 40.0), rel=0.05)
+
+
+@pytest.mark.parametrize("name", [row.name for row in table1.ROWS])
+def test_every_row_runs_end_to_end(name, tmp_path):
+    """From demonstrations to the row, at a scale where scores mean nothing."""
+    rows = table1.plan("smoke")
+    config = shipped("tower")
+    config.task.num_objects, config.data.directory = 2, str(tmp_path / "data")
+    base = options.override(config, [*table1.shared(config, "smoke"), "eval.split=test"])
+    row = next(row for row in rows if row.name == name)
+    found = table1.run(row, base, tmp_path / "run", build.split_seeds("test", 0, 2))
+    assert found["episodes"] == 2 and list(found["scores"]) == ["10001", "10002"]
+    assert found["parameters"] is None or found["parameters"] > 300 and found["samples"] == 4 and found["train_seconds"] > 0
+
+
 def test_robustness_end_to_end(tmp_path, capsys, monkeypatch):
     """A policy that knows nothing in two worlds, one of them in parts; a second call runs nothing."""
     save(tmp_path / "checkpoints", tiny_config(*SINGLE, "camera.calibrate=false"))
@@ -257,6 +319,7 @@ def test_a_wrong_request_ends_with_one_message(tmp_path, capsys):
         (robustness.command, [f"--checkpoint={tmp_path}"], "no checkpoint"),
         (ablation.command, ["--task=castle"], "--task must be one of 'pallet', 'tower', got 'castle'"),
         (main_table.command, ["--demos=many"], "--demos must be whole numbers"),
+        (table1.command, ["--scale=big"], "--scale must be one of 'smoke', 'cpu', 'paper', got 'big'"),
     ]:
         with pytest.raises(SystemExit, match="2"):
             command(arguments)

@@ -1,0 +1,214 @@
+"""The paper's table beside ours: `python -m experiments.table1 --task=tower --scale=cpu`.
+
+Trains every row of `ROWS` on the same demonstrations with the same number of samples, scores it on the same episodes of the test split, and
+writes `<scale>-<task>.json` (see `common`; a row has `published`, the paper's number or null, `parameters`, `samples` and `train_seconds`
+besides), `<scale>.md`, a table of both tasks as far as they are there, and `<scale>.webp`, the same as bars, to `--out`. The scales are
+`smoke` (every part, scores that mean nothing), `cpu` (compact networks) and `paper` (the paper's sizes and optimiser; for a GPU).
+Runs lie in `--workdir`, runs/table1/<task> unless told, each in <scale>-<row>. Started again, it goes on with the rows that are
+missing, and within a row where its training stopped; `--rows=two-stream,ours` runs only these (and the first).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import pathlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+
+from experiments import common
+from lala_jax import build, options, scoring, state
+from lala_jax.sim import tasks
+
+
+@dataclasses.dataclass(frozen=True)
+class Entry(common.Row):
+    """A row: how an agent differs from the default one at every scale, whose sizes it takes, and what the paper says of it."""
+
+    family: str = "paper"  # of FAMILIES
+    agent: str = "policy"  # or one of oracle.AGENTS, which are not trained
+    published: tuple[float | None, float | None] = (None, None)  # tower, pallet: score with 500 demonstrations, as published
+
+
+HIDDEN = ("model.max_height=true", "model.multi_action=false", "camera.backbone=resnet50_imagenet_v1")  # the goal's inside is
+VISIBLE = ("model.max_height=false", *HIDDEN[1:])
+COLOR = ("model.max_height=true", "model.multi_action=false")
+ROWS = (
+    Entry("ours", "ours, the default agent", family="ours"),
+    Entry("single", "LALA single stream", ("model.name=single", *HIDDEN), published=(13.4, 6.0)),
+    Entry("two-stream", "LALA two stream", ("model.name=two_stream", *HIDDEN), published=(15.8, 6.3)),
+    Entry("lateral", "LALA two stream + lateral", ("model.name=two_stream_lateral", *HIDDEN), published=(0.0, 0.0)),
+    Entry("single-visible", "single stream, height slices", ("model.name=single", *VISIBLE)),
+    Entry("two-stream-visible", "two stream, height slices", ("model.name=two_stream", *VISIBLE)),
+    Entry("lateral-visible", "two stream + lateral, height slices", ("model.name=two_stream_lateral", *VISIBLE)),
+    Entry("transporter", "Transporter (ignores the goal)", ("model.name=transporter", *COLOR)),
+    Entry("image-goal", "image-goal Transporter", ("model.name=image_goal", *COLOR)),
+    Entry("goal-split", "goal-split Transporter", ("model.name=goal_split", *COLOR)),
+    Entry("graph", "graph policy on true poses", ("model.name=graph",), family="graph"),
+    Entry("two-stream-plain", "two stream, no pretrained features", ("model.name=two_stream", *COLOR)),
+    Entry("two-stream-multi", "two stream, every right action", ("model.name=two_stream", *HIDDEN, "model.multi_action=true")),
+    Entry("ours-one-hot", "ours, one-hot labels", ("model.multi_action=false",), family="ours"),
+    Entry("ours-no-matching", "ours, no matching between the maps", ("model.matching=false",), family="ours"),
+    Entry("blind", "blind: places well, ignores identities", agent="blind"),
+    Entry("top_view", "sees the goal from right above only, else perfect", agent="top_view"),
+    Entry("oracle", "oracle", agent="oracle"),
+)
+LINES = ("blind", "top_view")  # drawn through the bars
+# What every row shares, and what the rows of a family do.
+SCALES = {
+    "smoke": (
+        *("data.directory={config.data.directory}-smoke", "data.demos=3", "train.steps=2", "train.batch_size=2", "eval.episodes=2"),
+        *("camera.height=60", "camera.width=80", "map.cell=0.0125", "map.slices=7", "model.rotations=4", "model.crop=8"),
+    ),
+    "cpu": ("data.demos=500", "train.steps=400", "train.batch_size=8", "eval.episodes=100"),
+    "paper": ("data.demos=500", "camera.height=480", "camera.width=640", "eval.episodes=100", "eval.parallel=4"),
+}
+FAMILIES = {
+    "ours": {
+        "smoke": ("model.width=4", "model.trunk_width=8", "model.trunk_blocks=1", "model.tokens=40"),
+        "cpu": (),
+        "paper": ("train.steps=2500", "train.batch_size=8"),
+    },
+    "paper": {
+        "smoke": ("model.width=4", "model.stages=2", "camera.stage=stem"),
+        "cpu": ("model.width=16",),
+        "paper": (
+            *("map.cell=0.003125", "model.crop=64", "model.channels=3", "model.width=64", "train.steps=20000", "train.batch_size=1"),
+            *("optim.schedule=constant", "optim.learning_rate=1e-4", "optim.weight_decay=0.0"),
+        ),
+    },
+    "graph": {"smoke": ("model.width=8",), "cpu": ("model.width=64",), "paper": ("model.width=64", "train.steps=2500")},
+}
+FLAGS = {"task": "tower", "scale": "cpu", "rows": "", "split": "test", "start": 0, "seed": 0, "out": "experiments/results/table1"}
+
+
+def main(config, workdir, *, task: str, scale: str, rows: str, split: str, start: int, seed: int, out: str) -> list[dict[str, Any]]:
+    """Train and score every row of the table at a scale, and write the table and the bars."""
+    options.check_choice("--scale", scale, SCALES)
+    base = options.override(config, [*shared(config, scale), f"eval.split={split}", f"eval.start={start}", f"seed={seed}"])
+    seeds, runs, out_path = (
+        build.split_seeds(split, start, base.eval.episodes),
+        pathlib.Path(build.workdir(config, workdir)),
+        pathlib.Path(out),
+    )
+    chosen = common.choose(plan(scale), rows, task)
+
+    def finish(done: Sequence[dict[str, Any]], kept: Sequence[dict[str, Any]]) -> dict[str, Any]:
+        del done, kept
+        return {"task": task, "scale": scale, "split": split}
+
+    def work(row: Entry) -> dict[str, Any]:
+        return {**run(row, base, runs / f"{scale}-{row.name}", seeds), "published": row.published[PUBLISHED.index(task)]}
+
+    done = common.fill(out_path / f"{scale}-{task}.json", chosen, work, finish, config=base, seeds=seeds)
+    write(out_path, scale)
+    return done
+
+
+PUBLISHED = ("tower", "pallet")  # the order in Entry.published
+
+
+def shared(config, scale: str) -> list[str]:
+    """Give the overrides of every row at a scale."""
+    return [text.format(config=config) for text in SCALES[scale]]
+
+
+def plan(scale: str) -> list[Entry]:
+    """List the rows with all overrides of a scale: the family's sizes first, then what the row is."""
+    return [dataclasses.replace(row, overrides=(*FAMILIES[row.family][scale], *row.overrides)) for row in ROWS]
+
+
+def run(row: Entry, base, directory: pathlib.Path, seeds: Sequence[int]) -> dict[str, Any]:
+    """Train a row and score it, or score an agent that needs no training."""
+    config = row.configs(base)[0]
+    if row.agent != "policy":
+        summary = scoring.baseline(row.agent, build.task(config), seeds=seeds, threads=config.data.threads)
+        return {**common.row_of(summary), "parameters": None, "samples": 0, "train_seconds": 0.0}
+    config = options.override(config, [f"train.eval_every={config.train.steps}", "train.eval_episodes=1", "eval.strips=0"])
+    params = jax.eval_shape(build.build_policy(config).init, jax.random.key(0))
+    facts = {"parameters": state.parameter_count(params), "samples": config.train.steps * config.train.batch_size}
+    return {**common.train_and_score(config, directory), **facts}
+
+
+# The table and the bars
+
+
+def stored(out: pathlib.Path, scale: str) -> dict[str, dict[str, dict[str, Any]]]:
+    """Read the finished rows of a scale, in the table's order: `{task: {name: row}}`."""
+    found = {}
+    for task in [name for name in PUBLISHED if name in tasks.names()]:
+        path = out / f"{scale}-{task}.json"
+        rows = {row["name"]: row for row in json.loads(path.read_text())["rows"]} if path.exists() else {}
+        found[task] = {row.name: rows[row.name] for row in ROWS if row.name in rows}
+    return {task: rows for task, rows in found.items() if rows}
+
+
+def write(out: pathlib.Path, scale: str) -> None:
+    """Write `<scale>.md` and `<scale>.webp` from the results of both tasks, and print the table."""
+    rows = stored(out, scale)
+    text = table(rows)
+    (out / f"{scale}.md").write_text(text + "\n")
+    bars(rows, out / f"{scale}.webp")
+    print(f"\n{text}\n\n{out / scale}.md")
+
+
+def table(results: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> str:
+    """Write the rows of each task side by side as a Markdown table; what is missing is left empty."""
+    header = ["", "parameters"]
+    for task in results:
+        header += [task, "complete", "training, s", "published"]
+    lines = []
+    for entry in ROWS:
+        own = [rows.get(entry.name) for rows in results.values()]
+        if not any(own):
+            continue
+        counts = next(row["parameters"] for row in own if row)
+        line = [entry.label, f"{counts:,}" if counts else ""]
+        for row in own:
+            line += cells(row) if row else [""] * 4
+        lines.append(line)
+    return common.table(header, lines)
+
+
+def cells(row: Mapping[str, Any]) -> list[str]:
+    """Write a task's part of a row."""
+    cost = f"{row['train_seconds']:.0f}" if row["train_seconds"] else ""
+    return [*common.cells(row)[1:], cost, "" if row["published"] is None else f"{row['published']:.1f}"]
+
+
+def bars(results: Mapping[str, Mapping[str, Mapping[str, Any]]], path: pathlib.Path) -> None:
+    """Draw the scores as bars with their intervals, a panel for each task, and lines where an agent without training gets to."""
+    from matplotlib import figure  # of the extra `plots`; the runs do not need it
+
+    shown = [entry for entry in ROWS if entry.agent == "policy" and any(entry.name in rows for rows in results.values())]
+    drawing = figure.Figure(figsize=(4 + 4 * len(results), 1.5 + 0.3 * len(shown)), layout="constrained")
+    axes = drawing.subplots(1, len(results), sharey=True, squeeze=False)[0]
+    for axis, (task, rows) in zip(axes, results.items(), strict=True):
+        own = [(place, rows[entry.name]) for place, entry in enumerate(shown) if entry.name in rows]
+        places, scores = [place for place, _ in own], [row["score"] for _, row in own]
+        low, high = ([abs(end - row["score"]) for _, row in own for end in [row["interval95"][side] or row["score"]]] for side in (0, 1))
+        axis.barh(places, scores, xerr=[low, high], color="tab:blue", ecolor="black", capsize=2)
+        published = [(place, row["published"]) for place, row in own if row["published"] is not None]
+        if published:
+            axis.plot(*zip(*[(score, place) for place, score in published], strict=True), "D", color="tab:red", label="published")
+        for name, style in zip(LINES, (":", "--"), strict=True):
+            if name in rows:
+                axis.axvline(rows[name]["score"], color="black", linestyle=style, label=name.replace("_", " "))
+        axis.set(title=task, xlim=(0, 100), xlabel="score", yticks=range(len(shown)), yticklabels=[entry.label for entry in shown])
+        if axis.get_legend_handles_labels()[0]:
+            axis.legend(loc="lower right", fontsize="small")
+    axes[0].invert_yaxis()
+    drawing.savefig(path, dpi=100)
+
+
+def command(argv: Sequence[str] | None = None):
+    """Run from the command line."""
+    return options.run(
+        main, flags=FLAGS, config_from=common.shipped_config, workdir="runs/table1/<task>", user_errors=common.USER_ERRORS, argv=argv
+    )
+
+
+if __name__ == "__main__":
+    command()
