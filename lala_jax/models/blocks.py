@@ -46,9 +46,8 @@ class ResNet43_8s(nn.Module):
     one with falling width, each followed by a doubling of the image; then a pair of `width / 4` channels that ends in
     `out`. The default has 9.82 M parameters (Transporter Networks, appendix; CLIPort's `ResNet43_8s`).
 
-    Two things differ from CLIPort. Its doubling stretches corner to corner, this one keeps cells over the cells that the
-    strides took. And its last pair has a ReLU between its two blocks, where `out` channels are left: for one channel,
-    2 of 8 seeds start with it negative everywhere, an output of zero that no gradient reaches. `head_relu` restores it.
+    One thing differs from CLIPort: its doubling stretches corner to corner, this one keeps cells over the cells that the
+    strides took.
 
     Raises ValueError for an image whose sides the strides do not divide.
     """
@@ -57,7 +56,6 @@ class ResNet43_8s(nn.Module):
     width: int = 64
     stages: int = 4
     dtype: jnp.dtype = jnp.float32
-    head_relu: bool = False
 
     @nn.compact
     def __call__(self, x: jax.Array, laterals: Sequence[jax.Array] | None = None) -> tuple[jax.Array, list[jax.Array]]:
@@ -77,8 +75,7 @@ class ResNet43_8s(nn.Module):
                 x = jnp.concatenate([x, laterals[level].astype(x.dtype)], -1)
                 x = nn.Conv(self.width << stage, (1, 1), dtype=self.dtype, name=f"lateral{stage}")(x)
             decoded.append(x)
-        relus = (self.head_relu, False)
-        x = residual_pair(x, max(self.width // 4, MIN_HEAD), "head", self.out, relus=relus, dtype=self.dtype)
+        x = residual_pair(x, max(self.width // 4, MIN_HEAD), "head", self.out, last_relu=False, dtype=self.dtype)
         return x, decoded
 
 
@@ -89,13 +86,16 @@ def residual_pair(
     out: int | None = None,
     *,
     stride: int = 1,
-    relus: tuple[bool, bool] = (True, True),
+    last_relu: bool = True,
     dtype: jnp.dtype = jnp.float32,
 ) -> jax.Array:
-    """Pass `[..., H, W, C]` through a projecting and an identity block of the module that calls, to `out` (or `width`) channels."""
+    """Pass `[..., H, W, C]` through a projecting and an identity block of the module that calls, to `out` (or `width`) channels.
+
+    Without `last_relu` neither ends in one.
+    """
     out = width if out is None else out
-    x = ResidualBlock(width, out, stride, True, relus[0], dtype, name=f"{name}_project")(x)
-    return ResidualBlock(width, out, 1, False, relus[1], dtype, name=f"{name}_identity")(x)
+    x = ResidualBlock(width, out, stride, True, last_relu, dtype, name=f"{name}_project")(x)
+    return ResidualBlock(width, out, 1, False, last_relu, dtype, name=f"{name}_identity")(x)
 
 
 def check_sides(shape: Sequence[int], stages: int) -> None:

@@ -46,7 +46,7 @@ class SpatialStream(nn.Module):
             width = max(self.width << stage >> 1, blocks.MIN_HEAD)
             laterals.append(x := blocks.upsample(blocks.residual_pair(x, width, f"up{stage}", dtype=self.dtype)))
         head = max(self.width // 4, blocks.MIN_HEAD)
-        x = blocks.residual_pair(x, head, "head", self.out, relus=(False, False), dtype=self.dtype)
+        x = blocks.residual_pair(x, head, "head", self.out, last_relu=False, dtype=self.dtype)
         return x[..., ::2, ::2, :], laterals
 
 

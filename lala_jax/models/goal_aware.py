@@ -223,8 +223,7 @@ class GoalAware(nn.Module):
         around, centre = self._around(layout, pick)
         crops = image.rotate_crop(around, centre, self.rotations, self.crop)
         turns = jnp.arange(self.rotations) * (2 * math.pi / self.rotations)
-        weight = jnp.repeat(jnp.repeat(target.weight, POOL, 0), POOL, 1)
-        key = self.key_net(self._picture(layout.goal, layout.levels, weight, target))
+        key = self.key_net(self._picture(layout.goal, layout.levels, _upsample(target.weight, POOL), target))
         kernels = self.query_net(_turn_offsets(crops, turns[:, None, None]))
         scale = (self.crop * self.crop * self.channels) ** -0.5
         return correlation.correlate(key[..., :-1], kernels * scale) + key[None, ..., -1]
