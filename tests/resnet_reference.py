@@ -1,14 +1,10 @@
 """ResNet-50 in NumPy, in float64 and without a batch, straight from a file's tensors: one network a family, each in its own terms."""
 
 import numpy as np
+import reference
 
 BLOCKS = (3, 4)  # of conv2 and conv3, as far as the references go
-
-
-def window(x, size, stride, pad):
-    """Windows `[rows, cols, C, size, size]` of an image `[H, W, C]`, zeros around it."""
-    x = np.pad(x, ((pad, pad), (pad, pad), (0, 0)))
-    return np.lib.stride_tricks.sliding_window_view(x, (size, size), axis=(0, 1))[::stride, ::stride]
+AROUND = ((1, 1), (1, 1), (0, 0))  # what is padded before the max pool
 
 
 def keras(tensors, rgb):
@@ -16,15 +12,14 @@ def keras(tensors, rgb):
     tensors, seen = {name: tensor.astype(np.float64) for name, tensor in tensors.items()}, {}
 
     def layer(path, x, conv, norm, stride=1, pad=0):
-        kernel = tensors[f"{conv}/kernel"]
-        y = np.einsum("rcihw,hwio->rco", window(x, len(kernel), stride, pad), kernel, optimize=True) + tensors.get(f"{conv}/bias", 0)
+        y = reference.convolve(x, tensors[f"{conv}/kernel"], stride, pad) + tensors.get(f"{conv}/bias", 0)
         gamma, beta, mean, variance = (tensors[f"{norm}/{leaf}"] for leaf in ("gamma", "beta", "moving_mean", "moving_variance"))
         seen[path] = gamma * (y - mean) / np.sqrt(variance + 1.001e-5) + beta
         return seen[path]
 
     x = 255 * rgb.astype(np.float64)[..., ::-1] - np.array([103.939, 116.779, 123.68])
     x = np.maximum(layer("stem", x, "conv1", "bn_conv1", 2, 3), 0)
-    x = window(x, 3, 2, 1).max((-2, -1))
+    x = reference.windows(np.pad(x, AROUND), 3, 2).max((-2, -1))
     for stage, blocks in enumerate(BLOCKS, 2):
         for block in range(blocks):
             path, name = f"conv{stage}_{block + 1}", f"{stage}{'abcd'[block]}_branch"
@@ -39,30 +34,16 @@ def keras(tensors, rgb):
 
 
 def torchvision(state, rgb):
-    """torchvision's ResNet-50 to layer2, or as far as `state` goes, channels first inside: the same dictionary, channels last."""
+    """torchvision's ResNet-50 to layer2, or as far as `state` goes: the same dictionary."""
     state, seen = {name: tensor.astype(np.float64) for name, tensor in state.items()}, {}
 
-    def convolve(x, weight, stride, pad):
-        rows, cols = ((side + 2 * pad - weight.shape[2]) // stride + 1 for side in x.shape[1:])
-        x, out = np.pad(x, ((0, 0), (pad, pad), (pad, pad))), np.zeros((len(weight), rows, cols))
-        for i in range(weight.shape[2]):
-            for j in range(weight.shape[3]):
-                out += np.tensordot(weight[:, :, i, j], x[:, i : i + stride * rows : stride, j : j + stride * cols : stride], 1)
-        return out
-
     def layer(path, x, conv, norm, stride=1, pad=0):
-        y = convolve(x, state[f"{conv}.weight"], stride, pad)
-        mean, variance, weight, bias = (
-            state[f"{norm}.{leaf}"][:, None, None] for leaf in ("running_mean", "running_var", "weight", "bias")
-        )
-        y = (y - mean) / np.sqrt(variance + 1e-5) * weight + bias
-        seen[path] = y.transpose(1, 2, 0)
-        return y
+        seen[path] = convolve_and_norm(state, x, conv, norm, stride, pad)
+        return seen[path]
 
-    x = ((rgb.astype(np.float64) - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225]).transpose(2, 0, 1)
+    x = (rgb.astype(np.float64) - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225]
     x = layer("stem", x, "conv1", "bn1", 2, 3).clip(0)
-    x = np.pad(x, ((0, 0), (1, 1), (1, 1)), constant_values=-np.inf)
-    x = np.lib.stride_tricks.sliding_window_view(x, (3, 3), axis=(1, 2))[:, ::2, ::2].max((-2, -1))
+    x = reference.windows(np.pad(x, AROUND, constant_values=-np.inf), 3, 2).max((-2, -1))
     for stage, blocks in enumerate(BLOCKS, 1):
         for block in range(blocks if f"layer{stage}.0.conv1.weight" in state else 0):
             path, name = f"conv{stage + 1}_{block + 1}", f"layer{stage}.{block}"
@@ -72,9 +53,15 @@ def torchvision(state, rgb):
             y = layer(f"{path}/expand", y, f"{name}.conv3", f"{name}.bn3")
             if block == 0:
                 x = layer(f"{path}/shortcut", x, f"{name}.downsample.0", f"{name}.downsample.1", stride)
-            x = (x + y).clip(0)
-            seen[path] = x.transpose(1, 2, 0)
+            seen[path] = x = (x + y).clip(0)
     return seen
+
+
+def convolve_and_norm(state, x, conv, norm, stride=1, pad=0):
+    """Convolve `[H, W, C]` without a bias and normalise by the stored statistics, both called and laid out as in PyTorch."""
+    y = reference.convolve(x, state[f"{conv}.weight"].transpose(2, 3, 1, 0), stride, pad)
+    mean, variance, weight, bias = (state[f"{norm}.{leaf}"] for leaf in ("running_mean", "running_var", "weight", "bias"))
+    return (y - mean) / np.sqrt(variance + 1e-5) * weight + bias
 
 
 def torchvision_state(rng, layers=2):

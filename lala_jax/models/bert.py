@@ -35,6 +35,12 @@ _PUBLISHED = {
 }
 
 
+def attend(query: jax.Array, key: jax.Array, value: jax.Array, mask: jax.Array | None = None, *, heads: int) -> jax.Array:
+    """Mix values `[..., S, D]` for queries `[..., T, D]`, each head a part of D, where `mask`, cast to `[..., heads, T, S]`, is true."""
+    split = (x.reshape(*x.shape[:-1], heads, -1) for x in (query, key, value))
+    return nn.dot_product_attention(*split, mask=mask).reshape(query.shape)
+
+
 class Layer(nn.Module):
     """One encoder layer: attention among the tokens, then two dense layers, each added to its input and normalised after."""
 
@@ -47,10 +53,8 @@ class Layer(nn.Module):
         """Map `[..., T, D]` to the same, attending to tokens where `mask` `[..., T]` is true."""
         dense = functools.partial(nn.Dense, dtype=self.dtype)
         width = x.shape[-1]
-        split = (*x.shape[:-1], self.heads, width // self.heads)
-        query, key, value = (dense(width, name=name)(x).reshape(split) for name in ("query", "key", "value"))
-        attended = nn.dot_product_attention(query, key, value, mask=mask[..., None, None, :], dtype=self.dtype)
-        y = dense(width, name="attended")(attended.reshape(x.shape))
+        query, key, value = (dense(width, name=name)(x) for name in ("query", "key", "value"))
+        y = dense(width, name="attended")(attend(query, key, value, mask[..., None, None, :], heads=self.heads))
         x = _norm(dtype=self.dtype, name="attended_norm")(x + y)
         y = nn.gelu(dense(self.hidden, name="hidden")(x), approximate=False)
         return _norm(dtype=self.dtype, name="output_norm")(x + dense(width, name="output")(y))

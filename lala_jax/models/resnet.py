@@ -16,7 +16,7 @@ import numpy as np
 from flax import linen as nn
 
 STAGES = {"stem": 0, "conv2": 3, "conv3": 4, "conv4": 6, "conv5": 3}  # blocks of each, in order
-STRIDED = ("reduce", "middle")
+STRIDED = ("reduce", "middle", "pool")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Flavour:
     An image enters as `(peak * rgb[..., order] - mean) / std`. Raises ValueError for an unknown `strided`.
     """
 
-    strided: str  # the convolution of a stage's first block that halves: "reduce" (1x1, the paper's) or "middle" (3x3)
+    strided: str  # what halves in a stage's first block: "reduce" (1x1, the paper's), "middle" (3x3), or "pool" before "expand" (CLIP's)
     order: tuple[int, int, int]  # of the channels: (0, 1, 2) is RGB, (2, 1, 0) is BGR
     peak: float  # what colours of 0..1 are scaled to
     mean: tuple[float, float, float]  # of each channel, in the order and on the scale just given
@@ -36,6 +36,13 @@ class Flavour:
     def __post_init__(self):
         if self.strided not in STRIDED:
             raise ValueError(f"Flavour.strided must be one of {STRIDED}, got {self.strided!r}")
+
+    def prepare(self, rgb: jax.Array) -> jax.Array:
+        """Bring RGB in 0..1, `[..., H, W, 3]`, to what the weights were trained on, float32: the only place that does."""
+        if rgb.ndim < 3 or rgb.shape[-1] != 3 or not jnp.issubdtype(rgb.dtype, jnp.floating):
+            raise ValueError(f"a ResNet needs RGB images [..., H, W, 3] of floats in 0..1, got {rgb.dtype} {list(rgb.shape)}")
+        order, mean, std = (np.array(value) for value in (self.order, self.mean, self.std))
+        return (self.peak * rgb.astype(jnp.float32)[..., order] - mean.astype(np.float32)) / std.astype(np.float32)
 
 
 # Keras Applications' `resnet_common.py` and `preprocess_input`; the paper's own weights, from Caffe (whose epsilon is 1e-5).
@@ -91,16 +98,18 @@ class Bottleneck(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        """Map `[..., H, W, C]` to `[..., ceil(H / stride), ceil(W / stride), 4 * mid]`."""
+        """Map `[..., H, W, C]` to `[..., H', W', 4 * mid]`: sides divided by the stride, rounded up, or down where the flavour pools."""
 
         def layer(name: str, out: int, size: int, stride: int = 1) -> ConvNorm:
             return ConvNorm(out, size, stride, self.flavour.epsilon, self.dtype, name=name)
 
-        first, second = (self.stride if self.flavour.strided == name else 1 for name in STRIDED)
+        first, second, pool = (self.stride if self.flavour.strided == name else 1 for name in STRIDED)
         y = nn.relu(layer("reduce", self.mid, 1, first)(x))
         y = nn.relu(layer("middle", self.mid, 3, second)(y))
+        if pool > 1:
+            x, y = (nn.avg_pool(z, (pool, pool), (pool, pool)) for z in (x, y))
         y = layer("expand", 4 * self.mid, 1)(y)
-        return nn.relu(y + (layer("shortcut", 4 * self.mid, 1, self.stride)(x) if self.project else x))
+        return nn.relu(y + (layer("shortcut", 4 * self.mid, 1, self.stride // pool)(x) if self.project else x))
 
 
 class ResNet50(nn.Module):
@@ -126,17 +135,10 @@ class ResNet50(nn.Module):
     @nn.compact
     def __call__(self, rgb: jax.Array) -> jax.Array:
         """Map RGB in 0..1, `[..., H, W, 3]`, to features, `[..., H', W', C]`, float32 whatever the layers compute in."""
-        if rgb.ndim < 3 or rgb.shape[-1] != 3 or not jnp.issubdtype(rgb.dtype, jnp.floating):
-            raise ValueError(f"ResNet50 needs RGB images [..., H, W, 3] of floats in 0..1, got {rgb.dtype} {list(rgb.shape)}")
-        x = nn.relu(ConvNorm(64, 7, 2, self.flavour.epsilon, self.dtype, name="stem")(self._prepare(rgb)))
+        x = self.flavour.prepare(rgb).astype(self.dtype)
+        x = nn.relu(ConvNorm(64, 7, 2, self.flavour.epsilon, self.dtype, name="stem")(x))
         # Keras pads with zeros and torchvision with -inf: after a ReLU, these are one. nn.max_pool pads one batch dimension at most.
         x = nn.max_pool(jnp.pad(x, [(0, 0)] * (x.ndim - 3) + [(1, 1), (1, 1), (0, 0)]), (3, 3), (2, 2))
         for name, mid, stride, first in _blocks(self.stage):
             x = Bottleneck(mid, stride, first, self.flavour, self.dtype, name=name)(x)
         return x.astype(jnp.float32)
-
-    def _prepare(self, rgb: jax.Array) -> jax.Array:
-        """Bring colours to what the weights were trained on: the only place that does."""
-        order, mean, std = (np.array(value) for value in (self.flavour.order, self.flavour.mean, self.flavour.std))
-        scaled = (self.flavour.peak * rgb.astype(jnp.float32)[..., order] - mean.astype(np.float32)) / std.astype(np.float32)
-        return scaled.astype(self.dtype)

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import reference
 
 from lala_jax.models import blocks
 
@@ -61,27 +62,15 @@ def test_costs_what_the_papers_costs(out, shape, giga):
     assert [x.shape[-3:] for x in decoded] == [(height // 4, width // 4, 256), (height // 2, width // 2, 128), (height, width, 64)]
 
 
-def _conv(x, kernel, stride=1):
-    """Convolve `[H, W, C]` cell by cell with half the kernel of zeros around."""
-    half = kernel.shape[0] // 2
-    padded = np.pad(x, ((half, half), (half, half), (0, 0)))
-    out = np.zeros((-(-x.shape[0] // stride), -(-x.shape[1] // stride), kernel.shape[-1]))
-    for i, j in np.ndindex(out.shape[:2]):
-        patch = padded[i * stride : i * stride + len(kernel), j * stride : j * stride + len(kernel)]
-        out[i, j] = np.einsum("abc,abco->o", patch, kernel)
-    return out
-
-
 @pytest.mark.parametrize("stride, project, last_relu", [(1, False, True), (1, False, False), (2, True, True)])
 def test_a_block_is_its_formula(stride, project, last_relu):
     block = blocks.ResidualBlock(3, 5, stride, project, last_relu)
     x = jax.random.normal(jax.random.key(0), (6, 4, 5))
     params = jax.jit(block.init)(jax.random.key(1, impl="rbg"), x)
-    kernels = {name: np.asarray(leaf["kernel"], np.float64) for name, leaf in params["params"].items()}
-    image = np.asarray(x, np.float64)
-    y = np.maximum(_conv(image, kernels["reduce"]), 0)
-    y = np.maximum(_conv(y, kernels["middle"], stride), 0)
-    y = _conv(y, kernels["expand"]) + (_conv(image, kernels["shortcut"], stride) if project else image)
+    leaves, image = params["params"], np.asarray(x, np.float64)
+    y = reference.relu(reference.conv(image, leaves["reduce"]))
+    y = reference.relu(reference.conv(y, leaves["middle"], stride))
+    y = reference.conv(y, leaves["expand"]) + (reference.conv(image, leaves["shortcut"], stride) if project else image)
     np.testing.assert_allclose(jax.jit(block.apply)(params, x), np.maximum(y, 0) if last_relu else y, atol=1e-5)
 
 
