@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import importlib.metadata
 import itertools
 import json
@@ -280,12 +281,13 @@ def training_step(config) -> Work:
     """Take training steps: draw, augment, render, fuse, loss, gradient, update."""
     recipe, states, key = build.recipe(config), states_of(config, BATCH), jax.random.key(0)
     fresh = jax.jit(lambda key: state.create(recipe.policy.init(key), recipe.optimizer))(jax.random.key(0, impl="rbg"))
-    jitted = compiling.jit(lambda run, states, key: train_step.train_step(recipe, run, states, key), donate_argnums=0)
-    program, facts = build_program(jitted, fresh, states, key)
+    frozen = recipe.policy.frozen
+    jitted = compiling.jit(functools.partial(train_step.train_step, recipe), donate_argnums=0)
+    program, facts = build_program(jitted, fresh, states, key, frozen)
     held = [fresh]
 
     def run():
-        held[0], metrics = program(held[0], states, key)
+        held[0], metrics = program(held[0], states, key, frozen)
         jax.block_until_ready((held[0], metrics))
 
     return Work(run, recipe.batch_size, facts)

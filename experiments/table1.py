@@ -46,6 +46,7 @@ ROWS = (
     Entry("transporter", "Transporter (ignores the goal)", ("model.name=transporter", *COLOR)),
     Entry("image-goal", "image-goal Transporter", ("model.name=image_goal", *COLOR)),
     Entry("goal-split", "goal-split Transporter", ("model.name=goal_split", *COLOR)),
+    Entry("cliport", "CLIPort, one sentence for the whole tower", ("model.name=cliport", *COLOR, "augment.mix=0.0"), ("tower",), (27.0, None)),
     Entry("graph", "graph policy on true poses", ("model.name=graph",), family="graph"),
     Entry("two-stream-plain", "two stream, no pretrained features", ("model.name=two_stream", *COLOR)),
     Entry("two-stream-multi", "two stream, every right action", ("model.name=two_stream", *HIDDEN, "model.multi_action=true")),

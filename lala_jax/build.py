@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from lala_jax import checkpoint, dataset, observe, optim, options, policy, train_step, types
-from lala_jax.models import goal_aware, graph, resnet, transporter
+from lala_jax import backbone, checkpoint, dataset, observe, optim, options, policy, policy_cliport, train_step, types
+from lala_jax.models import bert, cliport, goal_aware, graph, resnet, transporter
 from lala_jax.sim import scene, tasks
 from lala_jax.sim.tasks import base
 
-MODELS = ("goal_aware", *transporter.VARIANTS, "graph")
+MODELS = ("goal_aware", *transporter.VARIANTS, "cliport", "graph")
+TRUNK = "resnet50_imagenet_v1"  # of cliport
+NEWER = {"augment.mix": 0.5}  # what configs in checkpoints that are older than a field mean
 SPLITS = ("train", "val", "test")
 TEST_START = 10_001
 WORKDIR = "runs/<task>"  # the default of --workdir
@@ -106,14 +111,53 @@ def build_policy(config: Mapping[str, Any]) -> policy.Policy:
         return policy.GoalAwarePolicy(model=model, **choices)
     if fields["name"] == "graph":
         return policy.GraphPolicy(model=graph.Graph(width=fields["width"]), spec=spec, multi_action=fields["multi_action"])
+    shared |= {"yaw_bins": fields["rotations"], "width": fields["width"], "stages": fields["stages"]}
+    choices = {name: fields[name] for name in ("multi_action", "max_height")}
     try:
-        net = transporter.Transporter(
-            variant=fields["name"], yaw_bins=fields["rotations"], width=fields["width"], stages=fields["stages"], **shared
-        )
+        if fields["name"] == "cliport":
+            built = task(config)
+            told = encoders(built.name, built.num_objects)
+            return policy_cliport.CliportPolicy(model=cliport.Cliport(**shared), spec=spec, **told, **choices)
+        net = transporter.Transporter(variant=fields["name"], **shared)
+        return policy.TransporterPolicy(model=net, spec=spec, surface=surface(config), **choices)
     except ValueError as error:
         raise options.OptionsError(str(error)) from error
-    choices = {name: fields[name] for name in ("multi_action", "max_height")}
-    return policy.TransporterPolicy(model=net, spec=spec, surface=surface(config), **choices)
+
+
+@functools.lru_cache(maxsize=1)
+def encoders(task_name: str, count: int) -> dict[str, Any]:
+    """Load what `policy_cliport` takes as others trained it, for a task's sentences of `count` objects: `trunk`, `encoder`, `weights`."""
+    known = [name for name in tasks.names() if hasattr(tasks.get(name), "sentence")]
+    if task_name not in known:
+        raise options.OptionsError(f"model.name 'cliport' needs a task.name with a sentence: {', '.join(known)}, got {task_name!r}")
+    try:
+        from lala_jax import language  # needs an extra
+    except ModuleNotFoundError as error:
+        raise options.OptionsError(f"model.name 'cliport' is not installed: {error}") from error
+    trunk, variables = backbone.load(TRUNK, stage=policy_cliport.STAGES[-1])
+    encoder, template = bert.Bert(), language.template(task_name, count)
+    palette = np.array(list(base.COLORS.values()), np.float32) / 255
+    variables, words = jax.tree.map(jnp.asarray, (variables, language.load()))
+    centre = policy_cliport.mean_sentence(encoder, words, template, colors=len(palette))
+    weights = policy_cliport.Frozen(variables, words, template, jnp.asarray(palette), centre)
+    return {"trunk": trunk, "encoder": encoder, "weights": weights}
+
+
+def _mix(config: Mapping[str, Any]) -> float:
+    share = config["augment"].get("mix", NEWER["augment.mix"])
+    if not 0.0 <= share <= 1.0:
+        raise options.OptionsError(f"config field augment.mix must be at least 0 and at most 1, got {share!r}")
+    return share
+
+
+def _check_names(config: Mapping[str, Any]) -> None:
+    """Raise where the colours that training shows are not those that sentences name."""
+    recolor, mix, colors = config["augment"]["recolor"], _mix(config), config["task"]["colors"]
+    if recolor and mix:
+        raise options.OptionsError(f"model.name 'cliport' calls colours by their names: it needs augment.mix=0, got {mix!r}")
+    if not recolor and colors not in base.PALETTES:
+        known = " or ".join(base.PALETTES)
+        raise options.OptionsError(f"model.name 'cliport' calls colours by their names: it needs task.colors {known}, got {colors!r}")
 
 
 def recipe(config: Mapping[str, Any]) -> train_step.Recipe:
@@ -121,6 +165,8 @@ def recipe(config: Mapping[str, Any]) -> train_step.Recipe:
     train, augment = config["train"], config["augment"]
     for name in ("steps", "batch_size", "log_every", "save_every", "eval_every", "eval_episodes"):
         _positive(f"train.{name}", train[name])
+    if config["model"]["name"] == "cliport":
+        _check_names(config)
     sensors = train_step.augment.Sensors(**{name: augment[name] for name in ("depth_noise", "shift", "turn", "missing")})
     options.check_choice("optim.schedule", config["optim"]["schedule"], optim.SCHEDULES)
     return train_step.Recipe(
@@ -129,6 +175,7 @@ def recipe(config: Mapping[str, Any]) -> train_step.Recipe:
         optimizer=optim.create(config["optim"], steps=train["steps"]),
         batch_size=train["batch_size"],
         recolor=augment["recolor"],
+        mix=_mix(config),
         rigid=augment["rigid"],
         sensors=sensors,
         average_decay=config["optim"]["average_decay"],
@@ -138,7 +185,7 @@ def recipe(config: Mapping[str, Any]) -> train_step.Recipe:
 def run_settings(config: Mapping[str, Any]) -> dict[str, Any]:
     """List the fields that make a run what it is, by dotted name: all but those that say how often to report and where data lie."""
     free = ("eval.", "data.directory", "data.threads", "train.log_every", "train.save_every", "train.eval_every", "train.eval_episodes")
-    return {name: value for name, value in options.fields(config).items() if not name.startswith(free)}
+    return {name: value for name, value in (NEWER | options.fields(config)).items() if not name.startswith(free)}
 
 
 def input_spec(config: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,14 +1,14 @@
 """Policies: a network, its loss and its action, behind one interface for training and closed loop. Pure and unbatched.
 
-A policy is a static, hashable object; its parameters travel beside it. `init(key)`, `loss(params, key, state, current, goal)` and
-`act(params, current, goal)` are all that training and evaluation know of it; the `act` of a `privileged` one is told the true state too.
+A policy is a static, hashable object; its parameters travel beside it. All that training and evaluation know of it is in `Policy`.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from typing import ClassVar
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,32 @@ REFINE_DRAWS = 2  # times an object is held over its goal in a training example
 FIT_SCALE = 2.0  # logits per `goal_aware.MISFIT`
 PLACE_SHARE = 0.5  # what a place logit counts beside a fit when quarter turns are compared: both are log-odds of the same thing
 TOKEN_TOLERANCE = 0.008  # metres a goal voxel's centre may be outside the object it shows
+
+
+class Policy(Protocol):
+    """What training and evaluation know of a policy; `params` are those of `init`, together with what is `frozen`."""
+
+    privileged: ClassVar[bool]  # `act` is told the true state, too
+
+    @property
+    def frozen(self) -> Mapping[str, Any]:
+        """What `params` must hold besides: neither trained nor stored with them."""
+        ...
+
+    def init(self, key: jax.Array) -> Any:
+        """Make the parameters, a dict."""
+        ...
+
+    def loss(
+        self, params: Any, key: jax.Array, state: types.State, current: types.TopDownMap, goal: types.TopDownMap
+    ) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """Give `(loss, metrics)` of one example."""
+        ...
+
+    @property
+    def act(self) -> Callable[..., tuple[types.PickPlace, Heatmaps]]:
+        """Choose an action: `act(params, current, goal)`, and where it is `privileged` `act(params, current, goal, truth)`."""
+        ...
 
 
 @struct.dataclass
@@ -60,7 +86,8 @@ def surface_height(current: types.TopDownMap, cell: jax.Array) -> jax.Array:
     return jax.lax.dynamic_slice(padded, (cell[0], cell[1]), (size, size)).max()
 
 
-def _to_action(spec, current, pick, place_xy, yaw):
+def to_action(spec: types.MapSpec, current: types.TopDownMap, pick: jax.Array, place_xy: jax.Array, yaw: jax.Array) -> types.PickPlace:
+    """Pick at the integer cell `pick` `[2]` and place it at `place_xy` `[2]` (metres), at the heights seen there, turned by `yaw`."""
     pick_xy = types.world_from_index(spec, pick)
     place_cell = jnp.clip(types.index_from_world(spec, place_xy), 0, jnp.array([spec.rows - 1, spec.cols - 1]))
     return types.PickPlace(
@@ -123,6 +150,29 @@ def hits(sample: Sample, pick_logits: jax.Array, place_logits: jax.Array, *, spe
     }
 
 
+def picture(topdown_map: types.TopDownMap, *, max_height: bool) -> jax.Array:
+    """Give a map `[rows, cols, c]` as the paper's networks take it: what is highest, or without `max_height` all slices as channels."""
+    if max_height:
+        return transporter.normalise(topdown.max_height(topdown_map))
+    slices = transporter.normalise_slices(topdown_map.features[..., :3], topdown_map.count > 0, topdown_map.height)
+    return slices if topdown_map.surface is None else jnp.concatenate([slices, topdown_map.surface], axis=-1)
+
+
+def imitation(sample: Sample, logits: Heatmaps, *, spec: types.MapSpec) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """Give `(loss, metrics)` of one example: cross-entropy of pick and place (eqs. 4-6)."""
+    pick = losses.masked_cross_entropy(logits.pick, sample.pick_valid & sample.drawn)
+    place = losses.place_cross_entropy(logits.place, sample.bins, sample.cells, sample.valid)
+    metrics = {"loss_pick": pick, "loss_place": place, "loss": pick + place}
+    return pick + place, metrics | hits(sample, logits.pick, logits.place, spec=spec, rotations=len(logits.place))
+
+
+def best_place(current: types.TopDownMap, pick: jax.Array, place: jax.Array, *, spec: types.MapSpec) -> types.PickPlace:
+    """Place what is at the integer cell `pick` `[2]` at the best cell and bin of `place` `[k, rows, cols]` (eqs. 2 and 3)."""
+    turn, row, col = argmax_index(place)
+    xy = types.world_from_index(spec, jnp.stack([row, col]))
+    return to_action(spec, current, pick.astype(jnp.int32), xy, turn * (2 * math.pi / len(place)))
+
+
 @dataclasses.dataclass(frozen=True)
 class GoalAwarePolicy:
     """The default agent: `models.goal_aware` with multi-action, matching and refinement losses; the fields are ablation switches."""
@@ -135,6 +185,7 @@ class GoalAwarePolicy:
     max_height: bool = False  # see only what is highest in each column
     average_turns: bool = False  # act on the mean of the logits of both maps as they are and turned by 180 degrees
     privileged: ClassVar[bool] = False
+    frozen: ClassVar[Mapping[str, Any]] = {}
 
     @property
     def spec(self) -> types.MapSpec:
@@ -295,7 +346,7 @@ class GoalAwarePolicy:
             cell = jnp.clip(cells[best] + 0.5 + offset[:2], 0.0, jnp.array([spec.rows, spec.cols]))
             turn = turns[best] + offset[2]
         yaw = turn * (2 * math.pi / model.rotations)
-        return _to_action(spec, current, pick, types.world_from_cell(spec, cell), yaw), Heatmaps(pick_logits, place_logits)
+        return to_action(spec, current, pick, types.world_from_cell(spec, cell), yaw), Heatmaps(pick_logits, place_logits)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -311,37 +362,29 @@ class TransporterPolicy:
     max_height: bool = True
     surface: int = 0  # channels of the map's features of the surface
     privileged: ClassVar[bool] = False
+    frozen: ClassVar[Mapping[str, Any]] = {}
 
     def init(self, key: jax.Array):
         """Make the parameters."""
-        blank = self._input(empty_map(self.spec, surface=self.surface))
+        blank = picture(empty_map(self.spec, surface=self.surface), max_height=self.max_height)
         return self.model.init(key, blank, blank, jnp.zeros(2, jnp.int32))["params"]
 
-    def _input(self, topdown_map):
-        if self.max_height:
-            return transporter.normalise(topdown.max_height(topdown_map))
-        slices = transporter.normalise_slices(topdown_map.features[..., :3], topdown_map.count > 0, topdown_map.height)
-        return slices if topdown_map.surface is None else jnp.concatenate([slices, topdown_map.surface], axis=-1)
+    def _look(self, params, current, goal, pick=None):
+        current, goal = (picture(one, max_height=self.max_height) for one in (current, goal))
+        logits, intermediates = self.model.apply({"params": params}, current, goal, pick)
+        return Heatmaps(logits["pick"], logits["place"]), intermediates["pick_cell"]
 
     def loss(self, params, key: jax.Array, state: types.State, current: types.TopDownMap, goal: types.TopDownMap):
-        """Give `(loss, metrics)` of one example: cross-entropy of pick and place (eqs. 4-6)."""
+        """Give `(loss, metrics)` of one example, as `imitation` does."""
         rotations = self.model.yaw_bins
         sample = draw(key, state, spec=self.spec, rotations=rotations, candidates=state.ready, multi_action=self.multi_action)
-        logits, _ = self.model.apply({"params": params}, self._input(current), self._input(goal), sample.pick)
-        pick = losses.masked_cross_entropy(logits["pick"], sample.pick_valid & sample.drawn)
-        place = losses.place_cross_entropy(logits["place"], sample.bins, sample.cells, sample.valid)
-        metrics = {"loss_pick": pick, "loss_place": place, "loss": pick + place}
-        metrics |= hits(sample, logits["pick"], logits["place"], spec=self.spec, rotations=rotations)
-        return pick + place, metrics
+        logits, _ = self._look(params, current, goal, sample.pick)
+        return imitation(sample, logits, spec=self.spec)
 
     def act(self, params, current: types.TopDownMap, goal: types.TopDownMap) -> tuple[types.PickPlace, Heatmaps]:
         """Choose an action: the best pick cell and its best place cell and bin (eqs. 2 and 3)."""
-        logits, intermediates = self.model.apply({"params": params}, self._input(current), self._input(goal))
-        turn, row, col = argmax_index(logits["place"])
-        xy = types.world_from_index(self.spec, jnp.stack([row, col]))
-        yaw = turn * (2 * math.pi / self.model.yaw_bins)
-        action = _to_action(self.spec, current, intermediates["pick_cell"].astype(jnp.int32), xy, yaw)
-        return action, Heatmaps(logits["pick"], logits["place"])
+        logits, pick = self._look(params, current, goal)
+        return best_place(current, pick, logits.place, spec=self.spec), logits
 
 
 @dataclasses.dataclass(frozen=True)
@@ -352,6 +395,7 @@ class GraphPolicy:
     spec: types.MapSpec
     multi_action: bool = True
     privileged: ClassVar[bool] = True
+    frozen: ClassVar[Mapping[str, Any]] = {}
 
     def init(self, key: jax.Array):
         """Make the parameters."""
@@ -392,6 +436,3 @@ class GraphPolicy:
         cell = jnp.clip(types.index_from_world(self.spec, poses[:, :2]), 0, jnp.array([self.spec.rows - 1, self.spec.cols - 1]))
         low = jnp.full((self.spec.rows, self.spec.cols), logits.min() - 10.0)
         return low.at[cell[:, 0], cell[:, 1]].max(logits)
-
-
-Policy = GoalAwarePolicy | TransporterPolicy | GraphPolicy

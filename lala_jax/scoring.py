@@ -55,7 +55,7 @@ class PolicyAgent:
     """A policy as a `rollout.Agent` over up to `parallel` episodes: pads to one shape, so that there is one compilation."""
 
     def __init__(self, agent: policy.Policy, params: Any, observer: observe.Observer, scenes: Sequence[types.Scene], *, parallel: int, key):
-        self.observer, self._agent, self._params, self._parallel = observer, agent, params, parallel
+        self.observer, self._agent, self._params, self._parallel = observer, agent, params | agent.frozen, parallel
         padded = [*scenes, *[scenes[0]] * (parallel - len(scenes))]
         self._scenes = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *padded)
         self._key, key = jax.random.split(key)

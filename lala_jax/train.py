@@ -85,7 +85,7 @@ def _loop(config, recipe, run, states, store, stored, writer, stopped) -> state.
         plain = not bar.console.is_terminal  # a log file gets a line now and then instead of a bar
         shown = bar.add_task("training", total=total, completed=int(run.step), note="compiling")
         for number in range(int(run.step) + 1, total + 1):
-            run, metrics = step(recipe, run, states, key)
+            run, metrics = step(recipe, run, states, key, recipe.policy.frozen)
             seen.append(metrics)
             if number % config.train.log_every == 0 or number == total:
                 values = mean_metrics(seen, last=number)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -23,6 +24,7 @@ class Recipe:
     optimizer: optax.GradientTransformation
     batch_size: int
     recolor: bool = True
+    mix: float = 0.5  # share of recoloured examples whose colours are not the palette's
     rigid: bool = True
     sensors: augment.Sensors = augment.Sensors()
     average_decay: float = 0.998
@@ -38,7 +40,7 @@ def augmented(recipe: Recipe, key: jax.Array, example: types.State) -> types.Sta
     key_color, key_rigid = jax.random.split(key)
     if recipe.recolor:
         colors = palette(recipe.observer.task)
-        example = augment.recolor(key_color, example, palette=jnp.asarray(colors), apart=base.closest(colors))
+        example = augment.recolor(key_color, example, palette=jnp.asarray(colors), apart=base.closest(colors), mix=recipe.mix)
     if recipe.rigid:
         radius = float(np.linalg.norm(recipe.observer.task.base_size[:2])) / 2
         example = augment.rigid(key_rigid, example, spec=recipe.observer.spec, base_radius=radius)
@@ -63,11 +65,13 @@ def observations(recipe: Recipe, key: jax.Array, examples: types.State) -> tuple
     return jax.tree.map(lambda x: x[:size], maps), jax.tree.map(lambda x: x[size:], maps)
 
 
-def train_step(recipe: Recipe, run: state.TrainState, states: types.State, key: jax.Array) -> tuple[state.TrainState, dict[str, Any]]:
+def train_step(
+    recipe: Recipe, run: state.TrainState, states: types.State, key: jax.Array, frozen: Mapping[str, Any]
+) -> tuple[state.TrainState, dict[str, Any]]:
     """Draw a batch from `states` (leaves `[M, ...]`), augment, render, fuse and take one optimiser step; metrics are batch means.
 
-    A pure function of its arguments: the randomness of step n is `fold_in(key, n)`. Metrics that an example
-    does not define are NaN there and left out of the mean.
+    A pure function of its arguments: the randomness of step n is `fold_in(key, n)`. `frozen` is the policy's; as an argument, since what
+    a program closes over is compiled into it. Metrics that an example does not define are NaN there and left out of the mean.
     """
     key_batch, key_augment, key_noise, key_loss = jax.random.split(jax.random.fold_in(key, run.step), 4)
     index = jax.random.randint(key_batch, (recipe.batch_size,), 0, states.size.shape[0])
@@ -77,7 +81,7 @@ def train_step(recipe: Recipe, run: state.TrainState, states: types.State, key: 
     keys = jax.random.split(key_loss, recipe.batch_size)
 
     def mean_loss(params):
-        losses, metrics = jax.vmap(lambda *example: recipe.policy.loss(params, *example))(keys, examples, current, goal)
+        losses, metrics = jax.vmap(lambda *example: recipe.policy.loss(params | frozen, *example))(keys, examples, current, goal)
         return losses.mean(), jax.tree.map(jnp.nanmean, metrics)
 
     (_, metrics), grads = jax.value_and_grad(mean_loss, has_aux=True)(run.params)

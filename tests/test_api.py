@@ -17,14 +17,14 @@ CONFIGS = sorted(path for path in (ROOT / "configs").glob("*.py") if not path.na
 OPTIONS = ("", "smoke", "paper")
 
 ENTRY_POINTS = {"train", "collect", "evaluate", "publish", "report"}
-PURE = {"types", "perception", "models", "losses", "metrics", "augment", "policy"}
+PURE = {"types", "perception", "models", "losses", "metrics", "augment", "policy", "policy_cliport"}
 # Below each part, the parts of the package it may import; what is not listed may import all but entry points.
 BELOW = {
     "": set(),
     "types": set(),
     "perception": {"types"},
     "models": {"types", "perception"},
-    **dict.fromkeys(("losses", "metrics", "augment", "policy"), PURE),
+    **dict.fromkeys(("losses", "metrics", "augment", "policy", "policy_cliport"), PURE),
     **dict.fromkeys(("optim", "state"), PURE | {"optim", "state"}),
     "sim": {"types", "perception"},
     "options": set(),

@@ -423,7 +423,7 @@ def test_only_slices_show_what_is_under_the_top():
     blunt = POLICIES["single"]
     goals = [map_of(one, one.goal) for one in (state, swapped)]
     for agent, same in ((blunt, True), (dataclasses.replace(blunt, max_height=False), False)):
-        inner = [agent._input(goal)[..., :-1] for goal in goals]
+        inner = [policy.picture(goal, max_height=agent.max_height)[..., :-1] for goal in goals]
         inside = np.abs(np.asarray(inner[0] - inner[1])).max(-1)
         top = types.index_from_world(SPEC, state.goal[-1, :2])
         assert (inside[tuple(top)] == 0) == same

@@ -55,7 +55,7 @@ def advance(run, steps, *, data=None, seed=0):
     """Take steps as `train` does, giving the state and the last step's metrics; `run` is donated."""
     metrics = {}
     for _ in range(steps):
-        run, metrics = train.step(recipe(), run, states() if data is None else data, jax.random.key(seed))
+        run, metrics = train.step(recipe(), run, states() if data is None else data, jax.random.key(seed), recipe().policy.frozen)
     return run, jax.device_get(metrics)
 
 

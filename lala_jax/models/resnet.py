@@ -132,13 +132,18 @@ class ResNet50(nn.Module):
             raise ValueError(f"ResNet50.stage must be one of {', '.join(STAGES)}, got {self.stage!r}")
         super().__post_init__()
 
-    @nn.compact
     def __call__(self, rgb: jax.Array) -> jax.Array:
         """Map RGB in 0..1, `[..., H, W, 3]`, to features, `[..., H', W', C]`, float32 whatever the layers compute in."""
+        return self.pyramid(rgb)[self.stage]
+
+    @nn.compact
+    def pyramid(self, rgb: jax.Array) -> dict[str, jax.Array]:
+        """Map the same to the features after every stage up to the last, by the stage's name."""
         x = self.flavour.prepare(rgb).astype(self.dtype)
         x = nn.relu(ConvNorm(64, 7, 2, self.flavour.epsilon, self.dtype, name="stem")(x))
         # Keras pads with zeros and torchvision with -inf: after a ReLU, these are one. nn.max_pool pads one batch dimension at most.
         x = nn.max_pool(jnp.pad(x, [(0, 0)] * (x.ndim - 3) + [(1, 1), (1, 1), (0, 0)]), (3, 3), (2, 2))
+        found = {"stem": x}
         for name, mid, stride, first in _blocks(self.stage):
-            x = Bottleneck(mid, stride, first, self.flavour, self.dtype, name=name)(x)
-        return x.astype(jnp.float32)
+            found[name.partition("_")[0]] = x = Bottleneck(mid, stride, first, self.flavour, self.dtype, name=name)(x)
+        return {stage: features.astype(jnp.float32) for stage, features in found.items()}
