@@ -11,6 +11,7 @@ missing, and within a row where its training stopped; `--rows=two-stream,ours` r
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import json
 import pathlib
 from collections.abc import Mapping, Sequence
@@ -30,6 +31,7 @@ class Entry(common.Row):
     family: str = "paper"  # of FAMILIES
     agent: str = "policy"  # or one of oracle.AGENTS, which are not trained
     published: tuple[float | None, float | None] = (None, None)  # tower, pallet: score with 500 demonstrations, as published
+    extra: str = ""  # of the package, with a module of that name, that the row needs
 
 
 HIDDEN = ("model.max_height=true", "model.multi_action=false", "camera.backbone=resnet50_imagenet_v1")  # the goal's inside is
@@ -46,7 +48,15 @@ ROWS = (
     Entry("transporter", "Transporter (ignores the goal)", ("model.name=transporter", *COLOR)),
     Entry("image-goal", "image-goal Transporter", ("model.name=image_goal", *COLOR)),
     Entry("goal-split", "goal-split Transporter", ("model.name=goal_split", *COLOR)),
-    Entry("cliport", "CLIPort, one sentence for the whole tower", ("model.name=cliport", *COLOR, "augment.mix=0.0"), ("tower",), (27.0, None)),
+    Entry(
+        "cliport",
+        "CLIPort, one sentence for the whole tower",
+        ("model.name=cliport", *COLOR, "augment.mix=0.0"),
+        tasks=("tower",),
+        published=(27.0, None),
+        family="cliport",
+        extra="language",
+    ),
     Entry("graph", "graph policy on true poses", ("model.name=graph",), family="graph"),
     Entry("two-stream-plain", "two stream, no pretrained features", ("model.name=two_stream", *COLOR)),
     Entry("two-stream-multi", "two stream, every right action", ("model.name=two_stream", *HIDDEN, "model.multi_action=true")),
@@ -66,20 +76,22 @@ SCALES = {
     "cpu": ("data.demos=500", "train.steps=400", "train.batch_size=8", "eval.episodes=100"),
     "paper": ("data.demos=500", "camera.height=480", "camera.width=640", "eval.episodes=100", "eval.parallel=4"),
 }
+PAPER = {
+    "smoke": ("model.width=4", "model.stages=2", "camera.stage=stem"),
+    "cpu": ("model.width=16",),
+    "paper": (
+        *("map.cell=0.003125", "model.crop=64", "model.channels=3", "model.width=64", "train.steps=20000", "train.batch_size=1"),
+        *("optim.schedule=constant", "optim.learning_rate=1e-4", "optim.weight_decay=0.0"),
+    ),
+}
 FAMILIES = {
     "ours": {
         "smoke": ("model.width=4", "model.trunk_width=8", "model.trunk_blocks=1", "model.tokens=40"),
         "cpu": (),
         "paper": ("train.steps=2500", "train.batch_size=8"),
     },
-    "paper": {
-        "smoke": ("model.width=4", "model.stages=2", "camera.stage=stem"),
-        "cpu": ("model.width=16",),
-        "paper": (
-            *("map.cell=0.003125", "model.crop=64", "model.channels=3", "model.width=64", "train.steps=20000", "train.batch_size=1"),
-            *("optim.schedule=constant", "optim.learning_rate=1e-4", "optim.weight_decay=0.0"),
-        ),
-    },
+    "paper": PAPER,
+    "cliport": {"smoke": ("model.width=4", "model.stages=3"), **{scale: PAPER[scale] for scale in ("cpu", "paper")}},
     "graph": {"smoke": ("model.width=8",), "cpu": ("model.width=64",), "paper": ("model.width=64", "train.steps=2500")},
 }
 FLAGS = {"task": "tower", "scale": "cpu", "rows": "", "split": "test", "start": 0, "seed": 0, "out": "experiments/results/table1"}
@@ -94,7 +106,7 @@ def main(config, workdir, *, task: str, scale: str, rows: str, split: str, start
         pathlib.Path(build.workdir(config, workdir)),
         pathlib.Path(out),
     )
-    chosen = common.choose(plan(scale), rows, task)
+    chosen = [row for row in common.choose(plan(scale), rows, task) if can_run(row)]
 
     def finish(done: Sequence[dict[str, Any]], kept: Sequence[dict[str, Any]]) -> dict[str, Any]:
         del done, kept
@@ -119,6 +131,17 @@ def shared(config, scale: str) -> list[str]:
 def plan(scale: str) -> list[Entry]:
     """List the rows with all overrides of a scale: the family's sizes first, then what the row is."""
     return [dataclasses.replace(row, overrides=(*FAMILIES[row.family][scale], *row.overrides)) for row in ROWS]
+
+
+def can_run(row: Entry) -> bool:
+    """Say whether what a row needs is installed, and print it where not."""
+    try:
+        if row.extra:
+            importlib.import_module(f"lala_jax.{row.extra}")
+    except ModuleNotFoundError as error:
+        print(f"{row.name} is left out: {error}", flush=True)
+        return False
+    return True
 
 
 def run(row: Entry, base, directory: pathlib.Path, seeds: Sequence[int]) -> dict[str, Any]:
