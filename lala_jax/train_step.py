@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
@@ -33,15 +34,15 @@ def palette(task: base.Task) -> np.ndarray:
     return np.asarray(base.palette(task.colors if task.colors in base.PALETTES else "paper"), np.float32)
 
 
-def augmented(recipe: Recipe, key: jax.Array, example: types.State) -> types.State:
+def augmented(key: jax.Array, example: types.State, *, observer: observe.Observer, recolor: bool, rigid: bool) -> types.State:
     """Recolour and move one example, scene and goal alike. Unbatched."""
     key_color, key_rigid = jax.random.split(key)
-    if recipe.recolor:
-        colors = palette(recipe.observer.task)
+    if recolor:
+        colors = palette(observer.task)
         example = augment.recolor(key_color, example, palette=jnp.asarray(colors), apart=base.closest(colors))
-    if recipe.rigid:
-        radius = float(np.linalg.norm(recipe.observer.task.base_size[:2])) / 2
-        example = augment.rigid(key_rigid, example, spec=recipe.observer.spec, base_radius=radius)
+    if rigid:
+        radius = float(np.linalg.norm(observer.task.base_size[:2])) / 2
+        example = augment.rigid(key_rigid, example, spec=observer.spec, base_radius=radius)
     return example
 
 
@@ -72,7 +73,8 @@ def train_step(recipe: Recipe, run: state.TrainState, states: types.State, key: 
     key_batch, key_augment, key_noise, key_loss = jax.random.split(jax.random.fold_in(key, run.step), 4)
     index = jax.random.randint(key_batch, (recipe.batch_size,), 0, states.size.shape[0])
     examples = jax.tree.map(lambda leaf: leaf[index], states)
-    examples = jax.vmap(lambda k, e: augmented(recipe, k, e))(jax.random.split(key_augment, recipe.batch_size), examples)
+    disturb = functools.partial(augmented, observer=recipe.observer, recolor=recipe.recolor, rigid=recipe.rigid)
+    examples = jax.vmap(disturb)(jax.random.split(key_augment, recipe.batch_size), examples)
     current, goal = observations(recipe, key_noise, examples)
     keys = jax.random.split(key_loss, recipe.batch_size)
 
