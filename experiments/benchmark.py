@@ -306,8 +306,9 @@ def input_pipeline(config) -> Work:
         key_batch, key_augment, key_noise = jax.random.split(key, 3)
         index = jax.random.randint(key_batch, (recipe.batch_size,), 0, states.size.shape[0])
         examples = jax.tree.map(lambda leaf: leaf[index], states)
-        keys = jax.random.split(key_augment, recipe.batch_size)
-        return train_step.observations(recipe, key_noise, jax.vmap(lambda k, e: train_step.augmented(recipe, k, e))(keys, examples))
+        how = {"observer": recipe.observer, "recolor": recipe.recolor, "mix": recipe.mix, "rigid": recipe.rigid}
+        disturb = jax.vmap(functools.partial(train_step.augmented, **how))
+        return train_step.observations(recipe, key_noise, disturb(jax.random.split(key_augment, recipe.batch_size), examples))
 
     return compiled(inputs, jax.random.key(0), states, count=recipe.batch_size)
 

@@ -19,10 +19,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from lala_jax import build, checkpoint, options, pretrained, rollout, scoring, train, writers
+from lala_jax import build, checkpoint, loop, options, pretrained, rollout, scoring, train, writers
 from lala_jax.sim import tasks
 
-USER_ERRORS = (*build.USER_ERRORS, train.NonFiniteError)
+USER_ERRORS = (*build.USER_ERRORS, loop.NonFiniteError)
 
 
 @dataclasses.dataclass(frozen=True)

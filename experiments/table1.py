@@ -20,7 +20,7 @@ from typing import Any
 import jax
 
 from experiments import common
-from lala_jax import build, options, scoring, state
+from lala_jax import build, options, pretrain, scoring, state
 from lala_jax.sim import tasks
 
 
@@ -31,6 +31,8 @@ class Entry(common.Row):
     family: str = "paper"  # of FAMILIES
     agent: str = "policy"  # or one of oracle.AGENTS, which are not trained
     published: tuple[float | None, float | None] = (None, None)  # tower, pallet: score with 500 demonstrations, as published
+    few: bool = False  # learns from FEW demonstrations
+    scene: bool = False  # the backbone is first pre-trained in the task's scenes
     extra: str = ""  # of the package, with a module of that name, that the row needs
 
 
@@ -59,6 +61,15 @@ ROWS = (
     ),
     Entry("graph", "graph policy on true poses", ("model.name=graph",), family="graph"),
     Entry("two-stream-plain", "two stream, no pretrained features", ("model.name=two_stream", *COLOR)),
+    Entry("two-stream-scene", "two stream, features pre-trained in the scene", ("model.name=two_stream", *HIDDEN), scene=True),
+    Entry("two-stream-50", "two stream, 50 demonstrations", ("model.name=two_stream", *HIDDEN), few=True),
+    Entry(
+        "two-stream-scene-50",
+        "two stream, features pre-trained in the scene, 50 demonstrations",
+        ("model.name=two_stream", *HIDDEN),
+        scene=True,
+        few=True,
+    ),
     Entry("two-stream-multi", "two stream, every right action", ("model.name=two_stream", *HIDDEN, "model.multi_action=true")),
     Entry("ours-one-hot", "ours, one-hot labels", ("model.multi_action=false",), family="ours"),
     Entry("ours-no-matching", "ours, no matching between the maps", ("model.matching=false",), family="ours"),
@@ -72,10 +83,12 @@ SCALES = {
     "smoke": (
         *("data.directory={config.data.directory}-smoke", "data.demos=3", "train.steps=2", "train.batch_size=2", "eval.episodes=2"),
         *("camera.height=60", "camera.width=80", "map.cell=0.0125", "map.slices=7", "model.rotations=4", "model.crop=8"),
+        *("pretrain.steps=2", "pretrain.scenes=2", "pretrain.batch_size=2", "pretrain.window=32"),
     ),
     "cpu": ("data.demos=500", "train.steps=400", "train.batch_size=8", "eval.episodes=100"),
     "paper": ("data.demos=500", "camera.height=480", "camera.width=640", "eval.episodes=100", "eval.parallel=4"),
 }
+FEW = {"smoke": 2, "cpu": 50, "paper": 50}
 PAPER = {
     "smoke": ("model.width=4", "model.stages=2", "camera.stage=stem"),
     "cpu": ("model.width=16",),
@@ -130,7 +143,8 @@ def shared(config, scale: str) -> list[str]:
 
 def plan(scale: str) -> list[Entry]:
     """List the rows with all overrides of a scale: the family's sizes first, then what the row is."""
-    return [dataclasses.replace(row, overrides=(*FAMILIES[row.family][scale], *row.overrides)) for row in ROWS]
+    few = {True: (f"data.demos={FEW[scale]}",), False: ()}
+    return [dataclasses.replace(row, overrides=(*FAMILIES[row.family][scale], *few[row.few], *row.overrides)) for row in ROWS]
 
 
 def can_run(row: Entry) -> bool:
@@ -151,6 +165,9 @@ def run(row: Entry, base, directory: pathlib.Path, seeds: Sequence[int]) -> dict
         summary = scoring.baseline(row.agent, build.task(config), seeds=seeds, threads=config.data.threads)
         return {**common.row_of(summary), "parameters": None, "samples": 0, "train_seconds": 0.0}
     config = options.override(config, [f"train.eval_every={config.train.steps}", "train.eval_episodes=1", "eval.strips=0"])
+    if row.scene:
+        shared_run = directory.with_name(directory.name.removesuffix(row.name) + "backbone")  # of all rows of a scale
+        config.camera.backbone = str(pretrain.pretrain(config, str(shared_run)))
     params = jax.eval_shape(build.build_policy(config).init, jax.random.key(0))
     facts = {"parameters": state.parameter_count(params), "samples": config.train.steps * config.train.batch_size}
     return {**common.train_and_score(config, directory), **facts}

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 import safetensors
 
-from lala_jax import checkpoint
+from lala_jax import checkpoint, writers
 from lala_jax.models import resnet
 
 FOLDER = pathlib.Path(__file__).resolve().parent / "features"
@@ -63,6 +63,23 @@ def load(
     tensors = read(file, PACKAGED.get(name))
     layout = _recognise(file, tensors)
     return resnet.ResNet50(layout.flavour, stage, dtype), _variables(file, tensors, layout, stage)
+
+
+def save(file: str | os.PathLike[str], module: resnet.ResNet50, variables: Mapping[str, Any]) -> None:
+    """Write a trunk for `load`, float32 `.npz`, atomically: the layout is torchvision's or Keras' of today, as the arithmetic is.
+
+    Raises ValueError for a file of another suffix and for another arithmetic, which no layout stands for.
+    """
+    layout = next((layout for layout in _LAYOUTS if layout.flavour == module.flavour), None)
+    if layout is None or pathlib.Path(file).suffix != ".npz":
+        raise ValueError(f"backbone.save writes .npz files of resnet.KERAS or resnet.TORCHVISION, not {file} of {module.flavour}")
+    leaves, tensors = checkpoint.named(variables), {}
+    for name, (variable, _) in _tensors(layout, module.stage).items():
+        if not variable.endswith("/conv/bias"):  # Keras', which is in the mean
+            tensor = np.asarray(leaves[variable], np.float32)
+            tensors[name] = tensor.transpose(np.argsort(layout.axes)) if tensor.ndim == 4 else tensor
+    with writers.atomic(file) as stream:
+        np.savez(stream, **tensors)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lala_jax import backbone, checkpoint, dataset, observe, optim, options, policy, policy_cliport, train_step, types
-from lala_jax.models import bert, cliport, goal_aware, graph, resnet, transporter
+from lala_jax import backbone, checkpoint, dataset, observe, optim, options, policy, policy_cliport, pretrain_step, train_step, types
+from lala_jax.models import bert, cliport, cross_view, goal_aware, graph, resnet, transporter
 from lala_jax.sim import scene, tasks
 from lala_jax.sim.tasks import base
 
@@ -182,9 +182,50 @@ def recipe(config: Mapping[str, Any]) -> train_step.Recipe:
     )
 
 
+def pretrain_recipe(config: Mapping[str, Any]) -> pretrain_step.Recipe:
+    """Build the facts of a step of pre-training from the groups `pretrain`, `task`, `camera`, `optim` and `augment`."""
+    fields, camera, augment, optimiser = config["pretrain"], config["camera"], config["augment"], dict(config["optim"])
+    for name in ("steps", "batch_size", "learning_rate", "window", "patch", "scenes"):
+        _positive(f"pretrain.{name}", fields[name])
+    for name in ("log_every", "save_every"):
+        _positive(f"train.{name}", config["train"][name])
+    window, patch, side = fields["window"], fields["patch"], min(camera["height"], camera["width"])
+    if window % patch or window > side:
+        raise options.OptionsError(f"pretrain.window must be a multiple of pretrain.patch={patch} and at most {side}, got {window!r}")
+    if not 0 < fields["mask"] <= 1 or not round(fields["mask"] * (window // patch) ** 2):
+        raise options.OptionsError(f"config field pretrain.mask must be a share up to 1 that covers a patch, got {fields['mask']!r}")
+    options.check_choice("camera.stage", camera["stage"], resnet.STAGES)
+    options.check_choice("optim.schedule", optimiser["schedule"], optim.SCHEDULES)
+    # Stored means and variances that are 0 and 1 ask for inputs of about one, torchvision's.
+    flavour = backbone.load(fields["start"], stage=camera["stage"])[0].flavour if fields["start"] else resnet.TORCHVISION
+    return pretrain_step.Recipe(
+        model=cross_view.CrossView(flavour, camera["stage"], patch),
+        observer=observer(config),
+        optimizer=optim.create(optimiser | {"learning_rate": fields["learning_rate"]}, steps=fields["steps"]),
+        batch_size=fields["batch_size"],
+        window=window,
+        mask=fields["mask"],
+        recolor=augment["recolor"],
+        mix=_mix(config),
+        rigid=augment["rigid"],
+        average_decay=optimiser["average_decay"],
+    )
+
+
+def pretrain_settings(config: Mapping[str, Any]) -> dict[str, Any]:
+    """List the fields that make a run of pre-training what it is, by dotted name."""
+    ours = ("seed", "task.", "camera.", "map.", "augment.recolor", "augment.mix", "augment.rigid", "optim.", "pretrain.")
+    unused = ("camera.backbone", "optim.learning_rate")
+    return {name: value for name, value in options.fields(config).items() if name.startswith(ours) and name not in unused}
+
+
 def run_settings(config: Mapping[str, Any]) -> dict[str, Any]:
-    """List the fields that make a run what it is, by dotted name: all but those that say how often to report and where data lie."""
-    free = ("eval.", "data.directory", "data.threads", "train.log_every", "train.save_every", "train.eval_every", "train.eval_episodes")
+    """List the fields that make a run what it is, by dotted name: all but those that say how often to report and where data lie.
+
+    Nor does pre-training, a run of its own, belong to it.
+    """
+    free = ("pretrain.", "eval.", "data.directory", "data.threads")
+    free += ("train.log_every", "train.save_every", "train.eval_every", "train.eval_episodes")
     return {name: value for name, value in (NEWER | options.fields(config)).items() if not name.startswith(free)}
 
 

@@ -86,6 +86,16 @@ def get(arg: str, *, task: str) -> ml_collections.ConfigDict:
     config.train.eval_every = 800
     config.train.eval_episodes = 20  # to choose the best checkpoint, val split
 
+    config.pretrain = ml_collections.ConfigDict()  # of the backbone, by lala_jax.pretrain, to camera.stage; logged and saved as training is
+    config.pretrain.start = "resnet50_imagenet_v1"  # weights to begin with: a name or a file, as camera.backbone; none: random ones
+    config.pretrain.scenes = 512  # of the train split, which are then recoloured and moved
+    config.pretrain.window = 64  # pixels, the sides of what is cut out of each view about one of the objects
+    config.pretrain.patch = 8  # pixels
+    config.pretrain.mask = 0.9  # share of one view's patches that is covered
+    config.pretrain.steps = 1000
+    config.pretrain.batch_size = 8
+    config.pretrain.learning_rate = 1e-3  # the optimiser is that of optim otherwise
+
     config.eval = ml_collections.ConfigDict()
     config.eval.split = "val"
     config.eval.start = 0  # the first episode's place in the split
@@ -110,6 +120,9 @@ def _shrink(config) -> None:
     config.train.eval_every = 6
     config.train.eval_episodes = 2
     config.optim.warmup = 2
+    config.pretrain.scenes = 4
+    config.pretrain.steps = 6
+    config.pretrain.batch_size = 2
     config.eval.episodes = 4
     config.eval.parallel = 4
     config.eval.strips = 2
@@ -132,4 +145,5 @@ def _enlarge(config) -> None:
     config.train.steps = 20_000
     config.train.batch_size = 1
     config.train.eval_every = 5000
+    config.pretrain.window, config.pretrain.patch = 128, 16
     config.eval.parallel = 4

@@ -9,29 +9,15 @@ from __future__ import annotations
 
 import pathlib
 import signal
-import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from rich import progress
 
-from lala_jax import build, checkpoint, compiling, dataset, options, recording, scoring, state, train_step, types, writers
+from lala_jax import build, checkpoint, compiling, dataset, loop, options, recording, scoring, state, train_step, types, writers
 
 step = compiling.jit(train_step.train_step, static_argnums=0, donate_argnums=1)
-
-
-class NonFiniteError(RuntimeError):
-    """The training diverged: a metric that must be finite is not."""
-
-
-def check_finite(number: int, metrics: Mapping[str, float]) -> None:
-    """Raise NonFiniteError naming the step and the first loss (or gradient norm) that is not finite."""
-    for name, value in metrics.items():
-        if (name.startswith("loss") or name == "grad_norm") and not np.isfinite(value):
-            raise NonFiniteError(f"step {number}: {name} is {value}; the last checkpoint is from before; try a lower optim.learning_rate")
 
 
 def load_states(config: Mapping[str, Any]) -> types.State:
@@ -46,15 +32,7 @@ def start_or_resume(config: Mapping[str, Any], recipe: train_step.Recipe, store:
     """Make a fresh state, or restore the newest intact one; raises CheckpointError where it is of a run with other settings."""
     key = jax.random.key(config["seed"], impl="rbg")  # compiles four times faster than the default generator, once a layer
     fresh = jax.jit(lambda key: state.create(recipe.policy.init(key), recipe.optimizer))(key)
-    fresh = jax.device_put(fresh, jax.devices()[0])  # committed to it, as what is restored: both then run one compiled step
-    found = store.restore_latest(fresh)
-    if found is None:
-        return fresh
-    there = build.run_settings(checkpoint.describe(store.directory / "latest" / str(found[0]))["config"])
-    here = build.run_settings(writers.plain(options.to_dict(config)))
-    if changed := options.differences(there, here):
-        raise checkpoint.CheckpointError(f"{store.directory} holds a run with another {', '.join(changed)}: choose another --workdir")
-    return found[1]
+    return loop.start_or_resume(fresh, store, config, build.run_settings)
 
 
 def train_and_evaluate(config, workdir: str) -> dict[str, Any]:
@@ -79,34 +57,20 @@ def train_and_evaluate(config, workdir: str) -> dict[str, Any]:
 
 
 def _loop(config, recipe, run, states, store, stored, writer, stopped) -> state.TrainState:
-    key, total, seen, begin = jax.random.key(config.seed), config.train.steps, [], time.time()
-    columns = (*progress.Progress.get_default_columns(), progress.MofNCompleteColumn(), progress.TextColumn("{task.fields[note]}"))
-    with progress.Progress(*columns, speed_estimate_period=600) as bar:
-        plain = not bar.console.is_terminal  # a log file gets a line now and then instead of a bar
-        shown = bar.add_task("training", total=total, completed=int(run.step), note="compiling")
-        for number in range(int(run.step) + 1, total + 1):
-            run, metrics = step(recipe, run, states, key, recipe.policy.frozen)
-            seen.append(metrics)
-            if number % config.train.log_every == 0 or number == total:
-                values = mean_metrics(seen, last=number)
-                values["seconds_per_step"], seen, begin = (time.time() - begin) / len(seen), [], time.time()
-                writer.scalars(number, values)
-                note = f"loss {values['loss']:.2f}, pick {values['pick_right']:.2f}, place {values['place_right']:.2f}"
-                bar.update(shown, note=note)
-                if plain:
-                    left = (total - number) * values["seconds_per_step"] / 60
-                    print(f"step {number} of {total}: {note}; {left:.0f} minutes left", flush=True)
-            bar.update(shown, completed=number)
-            leaving = stopped()
-            if number % config.train.save_every == 0 or number == total or leaving:
-                mean_metrics([metrics], last=number)
-                store.save_latest(number, run, **stored)
-            if leaving:
-                break
-            if validation_due(config, number):
-                _validate(config, recipe, run, store, stored, writer)
-                begin = time.time()
-    return run
+    key = jax.random.key(config.seed)
+
+    def validate(number, run):
+        due = validation_due(config, number)
+        if due:
+            _validate(config, recipe, run, store, stored, writer)
+        return due
+
+    return loop.run(
+        lambda run: step(recipe, run, states, key, recipe.policy.frozen), run, total=config.train.steps, log_every=config.train.log_every,
+        save_every=config.train.save_every, save=lambda number, run: store.save_latest(number, run, **stored), writer=writer,
+        note=lambda mean: f"loss {mean['loss']:.2f}, pick {mean['pick_right']:.2f}, place {mean['place_right']:.2f}",
+        stopped=stopped, after=validate,
+    )  # fmt: skip
 
 
 def validation_due(config, number: int) -> bool:
@@ -117,18 +81,6 @@ def validation_due(config, number: int) -> bool:
 def was_validated(out: pathlib.Path, number: int) -> bool:
     """Say whether the metrics hold a validation of step `number`."""
     return any(row["step"] == number and "val_score" in row for row in writers.read_metrics(out / "metrics.jsonl"))
-
-
-def mean_metrics(seen: Sequence[Mapping[str, jax.Array]], *, last: int) -> dict[str, float]:
-    """Average the metrics of the steps up to `last`, leaving out NaN where a step did not define one of the accuracies.
-
-    Raises NonFiniteError naming the first step with a loss or gradient norm that is not finite.
-    """
-    host = [{name: float(value) for name, value in metrics.items()} for metrics in jax.device_get(list(seen))]
-    for number, metrics in enumerate(host, last - len(host) + 1):
-        check_finite(number, metrics)
-    columns = {name: np.array([metrics[name] for metrics in host]) for name in host[0]}
-    return {name: float(np.nan if np.isnan(values).all() else np.nanmean(values)) for name, values in columns.items()}
 
 
 def _validate(config, recipe, run, store, stored, writer) -> None:
@@ -160,4 +112,4 @@ def main(config, workdir) -> None:
 
 
 if __name__ == "__main__":
-    options.run(main, workdir=build.WORKDIR, user_errors=(*build.USER_ERRORS, NonFiniteError))
+    options.run(main, workdir=build.WORKDIR, user_errors=(*build.USER_ERRORS, loop.NonFiniteError))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 from typing import Any
 
@@ -35,15 +36,15 @@ def palette(task: base.Task) -> np.ndarray:
     return np.asarray(base.palette(task.colors if task.colors in base.PALETTES else "paper"), np.float32)
 
 
-def augmented(recipe: Recipe, key: jax.Array, example: types.State) -> types.State:
+def augmented(key: jax.Array, example: types.State, *, observer: observe.Observer, recolor: bool, mix: float, rigid: bool) -> types.State:
     """Recolour and move one example, scene and goal alike. Unbatched."""
     key_color, key_rigid = jax.random.split(key)
-    if recipe.recolor:
-        colors = palette(recipe.observer.task)
-        example = augment.recolor(key_color, example, palette=jnp.asarray(colors), apart=base.closest(colors), mix=recipe.mix)
-    if recipe.rigid:
-        radius = float(np.linalg.norm(recipe.observer.task.base_size[:2])) / 2
-        example = augment.rigid(key_rigid, example, spec=recipe.observer.spec, base_radius=radius)
+    if recolor:
+        colors = palette(observer.task)
+        example = augment.recolor(key_color, example, palette=jnp.asarray(colors), apart=base.closest(colors), mix=mix)
+    if rigid:
+        radius = float(np.linalg.norm(observer.task.base_size[:2])) / 2
+        example = augment.rigid(key_rigid, example, spec=observer.spec, base_radius=radius)
     return example
 
 
@@ -76,7 +77,9 @@ def train_step(
     key_batch, key_augment, key_noise, key_loss = jax.random.split(jax.random.fold_in(key, run.step), 4)
     index = jax.random.randint(key_batch, (recipe.batch_size,), 0, states.size.shape[0])
     examples = jax.tree.map(lambda leaf: leaf[index], states)
-    examples = jax.vmap(lambda k, e: augmented(recipe, k, e))(jax.random.split(key_augment, recipe.batch_size), examples)
+    how = {"observer": recipe.observer, "recolor": recipe.recolor, "mix": recipe.mix, "rigid": recipe.rigid}
+    disturb = functools.partial(augmented, **how)
+    examples = jax.vmap(disturb)(jax.random.split(key_augment, recipe.batch_size), examples)
     current, goal = observations(recipe, key_noise, examples)
     keys = jax.random.split(key_loss, recipe.batch_size)
 

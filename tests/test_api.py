@@ -16,7 +16,7 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 CONFIGS = sorted(path for path in (ROOT / "configs").glob("*.py") if not path.name.startswith("_"))
 OPTIONS = ("", "smoke", "paper")
 
-ENTRY_POINTS = {"train", "collect", "evaluate", "publish", "report"}
+ENTRY_POINTS = {"train", "pretrain", "collect", "evaluate", "publish", "report"}
 PURE = {"types", "perception", "models", "losses", "metrics", "augment", "policy", "policy_cliport"}
 # Below each part, the parts of the package it may import; what is not listed may import all but entry points.
 BELOW = {

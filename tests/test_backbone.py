@@ -171,6 +171,35 @@ def test_biases_move_means_and_come_all_or_not_at_all(tmp_path):
         mean(tensors)
 
 
+@pytest.mark.parametrize("stage", ["stem", "conv2", "conv3"])
+def test_what_is_written_reads_back_bit_for_bit(tmp_path, stage):
+    """In Keras' names of today from the packaged weights, and in torchvision's from random ones."""
+    module, variables = backbone.load(NAME, stage=stage)
+    backbone.save(tmp_path / "keras.npz", module, variables)
+    whole = resnet_reference.torchvision_state(np.random.default_rng(2))
+    for file in (tmp_path / "keras.npz", written(tmp_path / "whole.npz", npz(**whole))):
+        module, variables = backbone.load(file, stage=stage)
+        backbone.save(tmp_path / "again.npz", module, variables)
+        found = backbone.load(tmp_path / "again.npz", stage=stage)
+        assert found[0] == module and bits(found[1]) == bits(variables)
+    names = set(np.load(tmp_path / "again.npz").files)
+    assert "conv1.weight" in names and names < whole.keys() and len(names) == 5 * len(resnet.layers(stage))
+    assert bits(backbone.load(tmp_path / "keras.npz", stage=stage)[1]) == bits(backbone.load(NAME, stage=stage)[1])
+    with pytest.raises(checkpoint.MismatchError, match="up to conv4: it lacks"):
+        backbone.load(tmp_path / "again.npz", stage="conv4")
+
+
+def test_refuses_to_write_what_no_layout_stands_for(tmp_path):
+    module, variables = backbone.load(NAME, stage="stem")
+    for file, net in (
+        (tmp_path / "x.npz", module.clone(flavour=resnet.Flavour("middle", (0, 1, 2), 1.0, (0, 0, 0), (1, 1, 1), 1e-5))),
+        (tmp_path / "x.safetensors", module),
+    ):
+        with pytest.raises(ValueError, match="backbone.save writes .npz files of resnet.KERAS or resnet.TORCHVISION, not .*x"):
+            backbone.save(file, net, variables)
+    assert not list(tmp_path.iterdir())
+
+
 def without(state, *names):
     return {name: tensor for name, tensor in state.items() if name not in names}
 

@@ -292,7 +292,9 @@ def test_jitter_hardly_ever_changes_a_name():
 def test_the_config_says_how_examples_are_recoloured(tiny_build, mix):
     recipe = dataclasses.replace(build.recipe(tiny_config(f"augment.mix={mix}")), rigid=False)
     blank = jax.tree.map(lambda leaf: leaf[0], states())
-    recolor = jax.jit(jax.vmap(lambda key: train_step.augmented(recipe, key, blank).color))
+    recolor = jax.jit(
+        jax.vmap(lambda key: train_step.augmented(key, blank, observer=recipe.observer, recolor=True, mix=recipe.mix, rigid=False).color)
+    )
     color = recolor(jax.random.split(jax.random.key(0), 30))
     distance = np.linalg.norm(np.asarray(color)[..., None, :] - PALETTE, axis=-1).min(-1)
     assert (distance.max() < 0.2) if mix == 0 else (np.median(distance) > 0.2)

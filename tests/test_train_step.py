@@ -9,7 +9,7 @@ import numpy as np
 import optax
 import pytest
 
-from lala_jax import augment, build, checkpoint, options, state, train, train_step, types
+from lala_jax import augment, build, checkpoint, loop, options, state, train, train_step, types
 from lala_jax.sim import oracle, tasks
 
 OVERRIDES = (
@@ -105,7 +105,7 @@ def test_metrics_are_named_and_finite():
     shares = {"pick_right", "place_right", "place_near", "match_right", "fit_right"}
     assert set(metrics) == terms | shares | {"loss", "grad_norm", "refine_error"}
     assert np.isnan(metrics["fit_right"]) and metrics["loss_fit"] == 0, "a cube's quarter turn fits as well"
-    train.check_finite(1, metrics)
+    loop.check_finite(1, metrics)
     np.testing.assert_allclose(sum(metrics[name] for name in terms), metrics["loss"], rtol=1e-5)
     assert metrics["grad_norm"] > 0
 
@@ -115,25 +115,25 @@ def test_a_nan_in_the_data_is_named(field):
     """Where a pose, a goal or a symmetry is no number, the step's losses say so; the message names the step and the metric."""
     data = states()
     _, metrics = advance(start(), 1, data=data.replace(**{field: jnp.full_like(getattr(data, field), jnp.nan)}))
-    with pytest.raises(train.NonFiniteError, match=r"step 3: (loss\w*|grad_norm) is nan.*optim.learning_rate"):
-        train.check_finite(3, metrics)
+    with pytest.raises(loop.NonFiniteError, match=r"step 3: (loss\w*|grad_norm) is nan.*learning_rate"):
+        loop.check_finite(3, metrics)
 
 
 def test_nan_parameters_are_named():
     run = start()
     run = run.replace(params=jax.tree.map(lambda leaf: leaf * jnp.nan, run.params))
-    with pytest.raises(train.NonFiniteError, match=r"step 12: (loss\w*|grad_norm) is nan"):
-        train.check_finite(12, advance(run, 1)[1])
+    with pytest.raises(loop.NonFiniteError, match=r"step 12: (loss\w*|grad_norm) is nan"):
+        loop.check_finite(12, advance(run, 1)[1])
 
 
 def test_undefined_accuracies_do_not_stop_a_run():
     """An accuracy no example defines is NaN by design; the mean over steps leaves it out. A loss is never left out."""
     metrics = {"loss": 1.0, "grad_norm": 2.0, "pick_right": float("nan")}
     other = {"loss": 3.0, "grad_norm": 2.0, "pick_right": 0.5}
-    assert train.mean_metrics([metrics, other], last=9) == {"loss": 2.0, "grad_norm": 2.0, "pick_right": 0.5}
-    assert np.isnan(train.mean_metrics([metrics], last=9)["pick_right"])
-    with pytest.raises(train.NonFiniteError, match="step 8: loss is nan"):
-        train.mean_metrics([{**metrics, "loss": float("nan")}, other], last=9)
+    assert loop.mean_metrics([metrics, other], last=9) == {"loss": 2.0, "grad_norm": 2.0, "pick_right": 0.5}
+    assert np.isnan(loop.mean_metrics([metrics], last=9)["pick_right"])
+    with pytest.raises(loop.NonFiniteError, match="step 8: loss is nan"):
+        loop.mean_metrics([{**metrics, "loss": float("nan")}, other], last=9)
 
 
 def test_a_run_with_other_settings_is_not_continued(tmp_path):

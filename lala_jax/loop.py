@@ -1,0 +1,99 @@
+"""A run that can be stopped and goes on: what training and pre-training share."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from rich import progress
+
+from lala_jax import checkpoint, options, state, writers
+
+Metrics = Mapping[str, jax.Array]
+
+
+class NonFiniteError(RuntimeError):
+    """The training diverged: a metric that must be finite is not."""
+
+
+def check_finite(number: int, metrics: Mapping[str, float]) -> None:
+    """Raise NonFiniteError naming the step and the first loss (or gradient norm) that is not finite."""
+    for name, value in metrics.items():
+        if (name.startswith("loss") or name == "grad_norm") and not np.isfinite(value):
+            raise NonFiniteError(f"step {number}: {name} is {value}; the last checkpoint is from before; try a lower learning_rate")
+
+
+def mean_metrics(seen: Sequence[Metrics], *, last: int) -> dict[str, float]:
+    """Average the metrics of the steps up to `last`, leaving out NaN where a step did not define one of the accuracies.
+
+    Raises NonFiniteError naming the first step with a loss or gradient norm that is not finite.
+    """
+    host = [{name: float(value) for name, value in metrics.items()} for metrics in jax.device_get(list(seen))]
+    for number, metrics in enumerate(host, last - len(host) + 1):
+        check_finite(number, metrics)
+    columns = {name: np.array([metrics[name] for metrics in host]) for name in host[0]}
+    return {name: float(np.nan if np.isnan(values).all() else np.nanmean(values)) for name, values in columns.items()}
+
+
+def start_or_resume(
+    fresh: state.TrainState, store: checkpoint.Checkpoints, config, settings: Callable[[Mapping[str, Any]], dict[str, Any]]
+) -> state.TrainState:
+    """Give the newest intact state of the store, or `fresh`; raises CheckpointError where it is of a run with other `settings`."""
+    fresh = jax.device_put(fresh, jax.devices()[0])  # committed to it, as what is restored: both then run one compiled step
+    found = store.restore_latest(fresh)
+    if found is None:
+        return fresh
+    there = settings(checkpoint.describe(store.directory / "latest" / str(found[0]))["config"])
+    here = settings(writers.plain(options.to_dict(config)))
+    if changed := options.differences(there, here):
+        raise checkpoint.CheckpointError(f"{store.directory} holds a run with another {', '.join(changed)}: choose another --workdir")
+    return found[1]
+
+
+def run(
+    step: Callable[[state.TrainState], tuple[state.TrainState, Metrics]],
+    current: state.TrainState,
+    *,
+    total: int,
+    log_every: int,
+    save_every: int,
+    save: Callable[[int, state.TrainState], None],
+    note: Callable[[Mapping[str, float]], str],
+    writer: writers.Writer,
+    stopped: Callable[[], bool],
+    after: Callable[[int, state.TrainState], bool] = lambda *_: False,
+) -> state.TrainState:
+    """Take steps up to `total`, log means and save now and then; leave early, saved, once `stopped()`.
+
+    `note` puts the means into a few words. `save` and `after` get a step's number and state; `after`, called past every step that
+    did not leave, says whether it did anything, the time of which is then not the steps'.
+    """
+    seen, begin = [], time.time()
+    columns = (*progress.Progress.get_default_columns(), progress.MofNCompleteColumn(), progress.TextColumn("{task.fields[note]}"))
+    with progress.Progress(*columns, speed_estimate_period=600) as bar:
+        plain = not bar.console.is_terminal  # a log file gets a line now and then instead of a bar
+        shown = bar.add_task("training", total=total, completed=int(current.step), note="compiling")
+        for number in range(int(current.step) + 1, total + 1):
+            current, metrics = step(current)
+            seen.append(metrics)
+            if number % log_every == 0 or number == total:
+                values = mean_metrics(seen, last=number)
+                values["seconds_per_step"], seen, begin = (time.time() - begin) / len(seen), [], time.time()
+                writer.scalars(number, values)
+                bar.update(shown, note=note(values))
+                if plain:
+                    left = (total - number) * values["seconds_per_step"] / 60
+                    print(f"step {number} of {total}: {note(values)}; {left:.0f} minutes left", flush=True)
+            bar.update(shown, completed=number)
+            leaving = stopped()
+            if number % save_every == 0 or number == total or leaving:
+                mean_metrics([metrics], last=number)
+                save(number, current)
+            if leaving:
+                break
+            if after(number, current):
+                begin = time.time()
+    return current
