@@ -96,6 +96,17 @@ def test_jit_is_eager_vmap_is_a_loop_and_deeper_variables_are_ignored(folder):
     np.testing.assert_allclose(one[1, 2], pooled[1:4, 3:6].max((0, 1)), atol=1e-5)
 
 
+def test_the_pyramid_ends_every_stage(folder):
+    """What its name's last block gives; the last is what a call gives."""
+    found = variables("keras", folder)
+    features, state = apply("keras")(found, RGB)
+    pyramid = jax.jit(functools.partial(resnet.ResNet50(resnet.KERAS, "conv3").apply, method="pyramid"))(found, RGB)
+    assert list(pyramid) == ["stem", "conv2", "conv3"]
+    np.testing.assert_allclose(pyramid["conv2"], state["intermediates"]["conv2_3"]["__call__"][0], atol=1e-5)
+    np.testing.assert_allclose(pyramid["conv3"], features, atol=1e-5)
+    np.testing.assert_allclose(pyramid["stem"], resnet.ResNet50(resnet.KERAS, "stem").apply(found, RGB), atol=1e-5)
+
+
 def test_bfloat16_is_inside_only(folder):
     half = resnet.ResNet50(resnet.KERAS, "stem", jnp.bfloat16)
     found = variables("keras", folder)
