@@ -101,7 +101,7 @@ def test_the_pyramid_ends_every_stage(folder):
     found = variables("keras", folder)
     features, state = apply("keras")(found, RGB)
     pyramid = jax.jit(functools.partial(resnet.ResNet50(resnet.KERAS, "conv3").apply, method="pyramid"))(found, RGB)
-    assert list(pyramid) == ["stem", "conv2", "conv3"]
+    assert set(pyramid) == {"stem", "conv2", "conv3"}
     np.testing.assert_allclose(pyramid["conv2"], state["intermediates"]["conv2_3"]["__call__"][0], atol=1e-5)
     np.testing.assert_allclose(pyramid["conv3"], features, atol=1e-5)
     np.testing.assert_allclose(pyramid["stem"], resnet.ResNet50(resnet.KERAS, "stem").apply(found, RGB), atol=1e-5)
