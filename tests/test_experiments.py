@@ -2,6 +2,7 @@
 
 import json
 
+import jax
 import numpy as np
 import pytest
 from PIL import Image
@@ -284,8 +285,17 @@ def test_bars_are_as_long_as_the_scores(tmp_path):
     assert drawn(80.0, 0.0) == pytest.approx(drawn(40.0, 40.0), rel=0.05)
 
 
+@pytest.fixture
+def uncached():
+    """Many large programs: they are not written to the compilation cache, and go when the test ends."""
+    jax.config.update("jax_enable_compilation_cache", False)
+    yield
+    jax.config.update("jax_enable_compilation_cache", True)
+    jax.clear_caches()
+
+
 @pytest.mark.parametrize("name", [row.name for row in table1.ROWS])
-def test_every_row_runs_end_to_end(name, tmp_path):
+def test_every_row_runs_end_to_end(name, tmp_path, uncached):
     """From demonstrations to the row, at a scale where scores mean nothing."""
     rows = table1.plan("smoke")
     config = shipped("tower")
