@@ -21,7 +21,7 @@ import signal
 import threading
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -32,6 +32,7 @@ from lala_jax import writers
 FORMAT_VERSION = 1
 
 _LOG = logging.getLogger(__name__)
+_Read = TypeVar("_Read")
 
 
 class CheckpointError(ValueError):
@@ -116,24 +117,37 @@ def load(path: str | os.PathLike[str], template: Any = None, *, which: str = "be
     warning in the log. Without `template` the state is nested dicts of NumPy arrays keyed as the pytree was (sequences by
     "0", "1", ...); flax params come back as they were. Raises CheckpointError, MismatchError as `Checkpoints.restore_latest`.
     """
+
+    def read(folder: pathlib.Path, step: int) -> tuple[Any, dict[str, Any], dict[str, Any]]:
+        state, side = _restore(folder, step, template), _read_side(folder, step)
+        return state, side["config"], side["input_spec"]
+
+    return _first_intact(path, which, read)
+
+
+def describe(path: str | os.PathLike[str], *, which: str = "best") -> dict[str, Any]:
+    """Give `step`, `score`, `config`, `input_spec`, `leaves` (name to shape, dtype, crc32) of the step that `load` reads, leaves unread."""
+
+    def read(folder: pathlib.Path, step: int) -> dict[str, Any]:
+        side = _read_side(folder, step)
+        _check_files(folder / str(step), side)
+        return {"step": step, **side}
+
+    return _first_intact(path, which, read)
+
+
+def _first_intact(path: str | os.PathLike[str], which: str, read: Callable[[pathlib.Path, int], _Read]) -> _Read:
+    """Give what `read` makes of the first of a path's steps that is intact; damaged ones are logged and passed over."""
     problems = []
     for folder, step in _candidates(pathlib.Path(path).absolute(), which):
         try:
-            state = _restore(folder, step, template)
-            side = _read_side(folder, step)
-            return state, side["config"], side["input_spec"]
+            return read(folder, step)
         except MismatchError:
             raise
         except CheckpointError as error:
             _LOG.warning("passing over %s", error)
             problems.append(str(error))
     raise CheckpointError(f"no intact checkpoint at {path}:\n" + "\n".join(problems))
-
-
-def describe(path: str | os.PathLike[str], *, which: str = "best") -> dict[str, Any]:
-    """Give `step`, `score`, `config`, `input_spec`, `leaves` (name to shape, dtype, crc32) of what `load` tries first, payload unread."""
-    folder, step = _candidates(pathlib.Path(path).absolute(), which)[0]
-    return {"step": step, **_read_side(folder, step)}
 
 
 @contextlib.contextmanager

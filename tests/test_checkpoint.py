@@ -187,7 +187,7 @@ def test_a_broken_step_is_passed_over(directory, damage):
             if path.is_file():
                 path.write_bytes(b"")
     assert checkpoint.Checkpoints(directory).restore_latest(make_state())[0] == 20
-    assert int(checkpoint.load(directory)[0]["step"]) == 20
+    assert int(checkpoint.load(directory)[0]["step"]) == checkpoint.describe(directory)["step"] == 20
 
 
 def test_nothing_intact(directory):
@@ -196,8 +196,9 @@ def test_nothing_intact(directory):
             path.write_bytes(path.read_bytes()[:-8])
     with pytest.raises(checkpoint.CheckpointError, match=r"(?s)no intact checkpoint.*30.*20.*10"):
         checkpoint.Checkpoints(directory).restore_latest(make_state())
-    with pytest.raises(checkpoint.CheckpointError, match="no intact checkpoint"):
-        checkpoint.load(directory)
+    for read in (checkpoint.load, checkpoint.describe):
+        with pytest.raises(checkpoint.CheckpointError, match="no intact checkpoint"):
+            read(directory)
 
 
 def test_a_newer_run_is_not_overwritten(directory):
