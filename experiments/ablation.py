@@ -28,6 +28,7 @@ PERFECT = ("augment.depth_noise=0.0", "augment.shift=0.0", "augment.turn=0.0", "
 RECOVERIES = ("data.mistakes=0.15", "data.directory={config.data.directory}-mistakes")
 ROWS = (
     Lever("default", "default"),
+    Lever("default-again", "default, trained once more"),  # as far as the order of sums lets it differ: on one thread or two
     Lever("max-height", "max-height map instead of slices", ("model.max_height=true",)),
     Lever("one-hot", "one-hot labels", ("model.multi_action=false",)),
     Lever("matching", "no matching between the maps", ("model.matching=false",)),

@@ -3,7 +3,8 @@
 Trains every row of `ROWS` on the same demonstrations with the same number of samples, scores it on the same episodes of the test split, and
 writes `<scale>-<task>.json` (see `common`; a row has `published`, the paper's number or null, `parameters`, `samples` and `train_seconds`
 besides), `<scale>.md`, a table of both tasks as far as they are there, and `<scale>.webp`, the same as bars, to `--out`. The scales are
-`smoke` (every part, scores that mean nothing), `cpu` (compact networks) and `paper` (the paper's sizes and optimiser; for a GPU).
+`smoke` (every part, scores that mean nothing), `cpu` (the paper's pictures, maps, crops and widths divided by four, so that a row trains
+in half an hour on two cores) and `paper` (its own sizes and optimiser; for a GPU).
 Runs lie in `--workdir`, runs/table1/<task> unless told, each in <scale>-<row>. Started again, it goes on with the rows that are
 missing, and within a row where its training stopped; `--rows=two-stream,ours` runs only these (and the first).
 """
@@ -71,6 +72,7 @@ ROWS = (
         few=True,
     ),
     Entry("two-stream-multi", "two stream, every right action", ("model.name=two_stream", *HIDDEN, "model.multi_action=true")),
+    Entry("ours-same-maps", "ours, from the pictures and maps of the paper's agents", family="same"),
     Entry("ours-one-hot", "ours, one-hot labels", ("model.multi_action=false",), family="ours"),
     Entry("ours-no-matching", "ours, no matching between the maps", ("model.matching=false",), family="ours"),
     Entry("blind", "blind: places well, ignores identities", agent="blind"),
@@ -89,19 +91,26 @@ SCALES = {
     "paper": ("data.demos=500", "camera.height=480", "camera.width=640", "eval.episodes=100", "eval.parallel=4"),
 }
 FEW = {"smoke": 2, "cpu": 50, "paper": 50}
+QUARTER = ("camera.height=120", "camera.width=160", "map.cell=0.0125")
 PAPER = {
     "smoke": ("model.width=4", "model.stages=2", "camera.stage=stem"),
-    "cpu": ("model.width=16",),
+    "cpu": (*QUARTER, "model.crop=16", "model.width=16", "pretrain.window=32", "pretrain.patch=4"),
     "paper": (
         *("map.cell=0.003125", "model.crop=64", "model.channels=3", "model.width=64", "train.steps=20000", "train.batch_size=1"),
         *("optim.schedule=constant", "optim.learning_rate=1e-4", "optim.weight_decay=0.0"),
     ),
 }
+OURS = {
+    "smoke": ("model.width=4", "model.trunk_width=8", "model.trunk_blocks=1", "model.tokens=40"),
+    "cpu": (),
+    "paper": ("train.steps=2500", "train.batch_size=8"),
+}
 FAMILIES = {
-    "ours": {
-        "smoke": ("model.width=4", "model.trunk_width=8", "model.trunk_blocks=1", "model.tokens=40"),
-        "cpu": (),
-        "paper": ("train.steps=2500", "train.batch_size=8"),
+    "ours": OURS,
+    "same": {
+        "smoke": (*OURS["smoke"], "model.crop=12"),
+        "cpu": (*QUARTER, "model.crop=12", "model.tokens=352"),
+        "paper": (*OURS["paper"], "map.cell=0.003125", "model.crop=48", "model.tokens=2816"),
     },
     "paper": PAPER,
     "cliport": {"smoke": ("model.width=4", "model.stages=3"), **{scale: PAPER[scale] for scale in ("cpu", "paper")}},

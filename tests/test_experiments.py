@@ -30,15 +30,15 @@ def shipped(task):
 @pytest.mark.parametrize("module", [robustness, ablation])
 @pytest.mark.parametrize("task", tasks.names())
 def test_every_row_builds(module, task, unseen):
-    """A misspelt field or a wrong value is found here, and no row is another one's double."""
-    built = set()
-    for row in common.choose(module.ROWS, "", task):
+    """A misspelt field or a wrong value is found here, and no row is another one's double, but for the default trained again."""
+    rows, built = [row for row in common.choose(module.ROWS, "", task) if row.name != "default-again"], set()
+    for row in rows:
         for config in row.configs(shipped(task)):
             built.add(json.dumps(options.to_dict(config)))
             assert build.recipe(config).observer == build.observer(config)
             if module is robustness:
                 assert build.build_policy(config) == build.build_policy(shipped(task))
-    assert len(built) == sum(len(row.parts) for row in common.choose(module.ROWS, "", task))
+    assert len(built) == sum(len(row.parts) for row in rows)
 
 
 def test_the_runs_of_the_main_table_build(unseen):
