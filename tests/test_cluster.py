@@ -23,7 +23,7 @@ from experiments import ablation, common, main_table, robustness, table1
 from lala_jax import build, cluster, dataset, options, pretrain, recording, rollout, scoring, train, writers
 
 TESTS = pathlib.Path(__file__).parent
-SUBMITIT = pytest.importorskip("submitit")
+pytest.importorskip("submitit")
 
 
 @pytest.fixture(autouse=True)
