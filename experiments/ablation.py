@@ -3,18 +3,20 @@
 Each row of `ROWS` trains `configs/<task>.py` with one lever moved, all with the same budget, and is scored on val episodes. Writes
 `ablation-<task>.json` (see `common`; each row's `difference` is its score less the first row's, `train_seconds` as the training curve
 says) to `--out`, and prints a table. Runs lie in `--workdir`, runs/ablation/<task> unless told. Started again, it goes on with the
-rows that are missing, and within a row where its training stopped; `--rows=refine,recolor` runs only these.
+rows that are missing, and within a row where its training stopped; `--rows=refine,recolor` runs only these. With `--launcher=slurm` or
+`local` each row is a worker's (see `lala_jax.cluster`), after one recorded the demonstrations that rows share.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import pathlib
 from collections.abc import Sequence
 from typing import Any
 
 from experiments import common
-from lala_jax import build, options
+from lala_jax import build, cluster, options
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,7 +39,7 @@ ROWS = (
     Lever("refine", "no refinement", ("model.refine=false",)),
     Lever("sensors", "no camera errors in training", PERFECT),
     Lever("recoveries", "demonstrations with recoveries", RECOVERIES),
-    Lever("average-turns", "test-time averaging over half a turn", ("model.average_turns=true",), trains=False),
+    Lever("average-turns", "test-time averaging over half a turn", ("model.average_turns=true",), needs=("default",), trains=False),
     Lever("slices", "28 slices of 1 cm", ("map.slices=28",)),
     Lever("average-decay", "no averaging of weights", ("optim.average_decay=0.0",)),
 )
@@ -50,25 +52,29 @@ FLAGS = {
     "seed": 0,
     "rows": "",
     "out": "experiments/results/ablation",
+    **cluster.FLAGS,
 }
 
 
 def main(
-    config, workdir, *, task: str, steps: int, demos: int, start: int, episodes: int, seed: int, rows: str, out: str
-) -> list[dict[str, Any]]:
+    config, workdir, *, task: str, steps: int, demos: int, start: int, episodes: int, seed: int, rows: str, out: str,
+    launcher: str, launcher_options: str,
+) -> list[dict[str, Any]]:  # fmt: skip
     """Train and score a task's config with the levers of `ROWS`."""
+    launch = cluster.launcher(launcher, launcher_options)
     base = budget(config, steps=steps, demos=demos, start=start, episodes=episodes, seed=seed)
     seeds, runs = build.split_seeds("val", start, episodes), pathlib.Path(build.workdir(config, workdir))
+    chosen = common.choose(ROWS, rows, task)
 
     def finish(done: Sequence[dict[str, Any]], kept: Sequence[dict[str, Any]]) -> dict[str, Any]:
         del kept
-        for row in done[1:]:
+        for row in done[1:] if done[0]["name"] == chosen[0].name else ():
             row["difference"] = common.difference(row["scores"], done[0]["scores"], paired=True)
-        return {"task": task, "split": "val", "steps": steps, "demos": demos, "seed": seed, "reference": done[0]["name"]}
+        return {"task": task, "split": "val", "steps": steps, "demos": demos, "seed": seed, "reference": chosen[0].name}
 
     path = pathlib.Path(out) / f"ablation-{task}.json"
-    chosen = common.choose(ROWS, rows, task)
-    done = common.fill(path, chosen, lambda row: run(row, base, runs, seeds), finish, config=base, seeds=seeds)
+    work, before = functools.partial(run, base=base, runs=runs, seeds=seeds), common.recordings([row for row in chosen if row.trains], base)
+    done = common.fill(path, chosen, work, finish, config=base, seeds=seeds, launch=launch, before=before)
     print(f"\n{table(done)}\n\n{path}")
     return done
 
@@ -80,7 +86,7 @@ def budget(config, *, steps: int, demos: int, start: int, episodes: int, seed: i
     return options.override(config, [f"{name}={value}" for name, value in fields.items()])
 
 
-def run(row: Lever, base, runs: pathlib.Path, seeds: Sequence[int]) -> dict[str, Any]:
+def run(row: Lever, *, base, runs: pathlib.Path, seeds: Sequence[int]) -> dict[str, Any]:
     """Train where the row has weights of its own, and score."""
     config = row.configs(base)[0]
     if row.trains:
@@ -103,4 +109,6 @@ def command(argv: Sequence[str] | None = None):
 
 
 if __name__ == "__main__":
-    command()
+    from experiments import ablation as module  # the name under which workers find what they are sent
+
+    module.command()

@@ -2,24 +2,26 @@
 
 Every file is `{"task", ..., "rows": [...]}`. A row has `name`, `label`, what identifies it (`overrides`, `seeds`, `checkpoint` or null,
 `config`), its scores (`score`, `interval95`, `complete_percent`, `first_failures`, ..., `scores` by seed) and `seconds`, how long it took.
+Rows run one after the other in this process, or each in a worker of its own.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import json
 import math
 import pathlib
+import shutil
 import time
-import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
 import numpy as np
 
-from lala_jax import build, checkpoint, loop, options, pretrained, rollout, scoring, train, writers
+from lala_jax import build, cluster, loop, options, recording, rollout, scoring, train, writers
 from lala_jax.sim import tasks
 
 USER_ERRORS = (*build.USER_ERRORS, loop.NonFiniteError)
@@ -34,6 +36,7 @@ class Row:
     overrides: tuple[str, ...] = ()
     parts: tuple[tuple[str, ...], ...] = ((),)  # further overrides, each for an equal share of the episodes
     tasks: tuple[str, ...] = ()  # () for all
+    needs: tuple[str, ...] = ()  # rows whose weights it takes: they come before
 
     def changes(self, config) -> list[list[str]]:
         """Give the overrides of each part."""
@@ -42,6 +45,36 @@ class Row:
     def configs(self, config) -> list:
         """Give the config of each part."""
         return [options.override(config, texts) for texts in self.changes(config)]
+
+
+@dataclasses.dataclass(frozen=True)
+class Before:
+    """What several rows share, and workers do first: in one process the first of the rows does it."""
+
+    name: str
+    call: Callable[[], Any]
+    rows: tuple[str, ...]
+
+
+def recordings(rows: Sequence[Row], config) -> list[Before]:
+    """Give the recording of the demonstrations that several of `rows` learn from, as many as the most demanding takes."""
+    users: dict[str, list[tuple[str, Any]]] = {}
+    for row in rows:
+        own = row.configs(config)[0]
+        users.setdefault(own.data.directory, []).append((row.name, own))
+    found = []
+    for directory, pairs in users.items():
+        if len(pairs) > 1:
+            largest = max((own for _, own in pairs), key=lambda own: own.data.demos)
+            names = tuple(name for name, _ in pairs)
+            found.append(Before(f"demonstrations in {directory}", functools.partial(record, largest), names))
+    return found
+
+
+def record(config) -> None:
+    """Record the demonstrations of a config, alone: the worker of a command that was killed may still be at it."""
+    with cluster.exclusive(pathlib.Path(config.data.directory)):
+        recording.collect(config, quiet=True)
 
 
 def choose(rows: Sequence, names: str, task: str) -> list:
@@ -73,27 +106,58 @@ def fill(
     config,
     seeds: Sequence[int],
     weights: Mapping[str, Any] | None = None,
+    launch: cluster.Launcher | None = None,
+    before: Sequence[Before] = (),
 ) -> list[dict[str, Any]]:
     """Give the fields of all `rows`; those that are not in the file are run, and the file is written after each.
 
     A row of the file with a row's name and another `identity` is run again and replaced, other rows stay. `finish(done, kept)` may
-    add to the rows that are `done`, and gives the file's other fields; `kept` are all rows of the file that are results of the same
-    seeds and weights, also those not asked for.
+    add to the rows that are `done`, in the order of `rows`, and gives the file's other fields; `kept` are all rows of the file that are
+    results of the same seeds and weights, also those not asked for. With `launch` the rows are run by workers, after what they share,
+    `before`; where some are missing in the end, the file holds the others, and SystemExit is raised.
     """
     stored = {row["name"]: row for row in json.loads(path.read_text())["rows"]} if path.exists() else {}
-    wanted = [identity(row, config, seeds, weights=weights) for row in rows]  # of all, before the first is run
-    done = []
-    for row, own in zip(rows, wanted, strict=True):
-        found = stored.get(row.name)
-        if found is None or not is_same(found, own):
-            print(f"{row.name}: {row.label}", flush=True)
-            begin, result, device = time.time(), run(row), jax.devices()[0].device_kind
-            found = {"name": row.name, **result, "seconds": time.time() - begin, "device": device, **own}
-        stored[row.name] = found | {"label": row.label}
-        done.append(stored[row.name])
-        kept = [one for one in stored.values() if all(one[name] == own[name] for name in ("seeds", "checkpoint"))]
-        writers.write_json(path, {**finish(done, kept), "rows": list(stored.values())})
-    return done
+    order = list(dict.fromkeys([*stored, *(row.name for row in rows)]))
+    wanted = {row.name: identity(row, config, seeds, weights=weights) for row in rows}  # of all, before the first is run
+    found, done = {name: stored[name] for name, own in wanted.items() if name in stored and is_same(stored[name], own)}, {}
+    results = _here(rows, found, run, wanted) if launch is None else _fanned(launch, path, rows, found, run, wanted, before)
+    for row, result in results:
+        stored[row.name] = done[row.name] = result | {"label": row.label}
+        finished = [done[one.name] for one in rows if one.name in done]
+        kept = [one for one in stored.values() if all(one[name] == wanted[row.name][name] for name in ("seeds", "checkpoint"))]
+        ordered = [stored[name] for name in order if name in stored]
+        writers.write_json(path, {**finish(finished, kept), "rows": ordered})
+    return [done[row.name] for row in rows]
+
+
+def outcome(row: Row, run: Callable[[Any], Mapping[str, Any]], own: Mapping[str, Any]) -> dict[str, Any]:
+    """Run a row: all its fields but the label."""
+    print(f"{row.name}: {row.label}", flush=True)
+    begin, result, device = time.time(), run(row), jax.devices()[0].device_kind
+    return {"name": row.name, **result, "seconds": time.time() - begin, "device": device, **own}
+
+
+def _here(rows, found, run, wanted) -> Iterator[tuple[Row, dict[str, Any]]]:
+    """Yield the rows in order, those that are not `found` after running them."""
+    for row in rows:
+        yield row, found[row.name] if row.name in found else outcome(row, run, wanted[row.name])
+
+
+def _fanned(launch, path, rows, found, run, wanted, before) -> Iterator[tuple[Row, dict[str, Any]]]:
+    """Yield the rows that are `found`, then the others as workers finish them."""
+    yield from ((row, found[row.name]) for row in rows if row.name in found)
+    left, folder = {row.name: row for row in rows if row.name not in found}, path.with_suffix(".parts")
+    shared = [one for one in before if left.keys() & set(one.rows)]
+    tasks = [cluster.Task(one.name, one.call) for one in shared]
+    for name, row in left.items():
+        needs = (*row.needs, *(one.name for one in shared if name in one.rows))
+        call = functools.partial(outcome, row, run, wanted[name])
+        tasks.append(cluster.Task(name, call, folder / f"{name}.json", wanted[name], needs))
+    for name, result in cluster.run(launch, tasks, folder):
+        if name in left:
+            yield left[name], result
+            (folder / f"{name}.json").unlink()  # the file holds it now
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 # Runs and scores
@@ -119,8 +183,7 @@ def train_and_score(config, directory: pathlib.Path) -> dict[str, Any]:
 def load_weights(path: str, config) -> tuple[Any, dict[str, Any]]:
     """Load the averaged parameters of a checkpoint, and say what identifies them."""
     params = scoring.check_checkpoint(path, config, build.build_policy(config))
-    content = b"".join(np.asarray(leaf).tobytes() for _, leaf in sorted(checkpoint.named(params).items()))
-    return params, {"step": pretrained.describe(path)["step"], "crc32": zlib.crc32(content)}
+    return params, scoring.fingerprint(path, params)
 
 
 def score(config, params, seeds: Sequence[int]) -> dict[str, Any]:

@@ -4,11 +4,12 @@ Trains `configs/<task>.py` as it ships, the first number of demonstrations with 
 run on the test split. Fewer demonstrations are the first ones recorded. Writes `main.json` (see `common`; `means` holds the mean over
 the seeds of each number of demonstrations) to `--out`, experiments/results/<task> unless told, and prints a table. Runs lie in
 `--workdir`, each in <workdir>-<demos>-<seed>. Started again, it goes on with the runs that are missing, and within a run where its
-training stopped.
+training stopped. With `--launcher=slurm` or `local` each run is a worker's (see `lala_jax.cluster`), after one recorded the demonstrations.
 """
 
 from __future__ import annotations
 
+import functools
 import pathlib
 from collections.abc import Sequence
 from typing import Any
@@ -16,23 +17,28 @@ from typing import Any
 import numpy as np
 
 from experiments import common
-from lala_jax import build, options
+from lala_jax import build, cluster, options
 
-FLAGS = {"task": "tower", "demos": "500,50,10", "seeds": "0,1,2", "split": "test", "start": 0, "episodes": 100, "out": ""}
+FLAGS = {"task": "tower", "demos": "500,50,10", "seeds": "0,1,2", "split": "test", "start": 0, "episodes": 100, "out": "", **cluster.FLAGS}
 
 
-def main(config, workdir, *, task: str, demos: str, seeds: str, split: str, start: int, episodes: int, out: str) -> list[dict[str, Any]]:
+def main(
+    config, workdir, *, task: str, demos: str, seeds: str, split: str, start: int, episodes: int, out: str,
+    launcher: str, launcher_options: str,
+) -> list[dict[str, Any]]:  # fmt: skip
     """Train a task's config for each number of demonstrations and seed, and score on the test split."""
+    launch = cluster.launcher(launcher, launcher_options)
     base = options.override(config, [f"eval.split={split}", f"eval.start={start}", f"eval.episodes={episodes}"])
     scored = build.split_seeds(split, start, episodes)
-    rows, runs = plan(numbers("--demos", demos), numbers("--seeds", seeds)), build.workdir(config, workdir)
+    rows = plan(numbers("--demos", demos), numbers("--seeds", seeds))
 
     def finish(done: Sequence[dict[str, Any]], kept: Sequence[dict[str, Any]]) -> dict[str, Any]:
         del done
         return {"task": task, "split": split, "means": means(kept)}
 
     path = pathlib.Path(out or f"experiments/results/{task}") / "main.json"
-    done = common.fill(path, rows, lambda row: run(row, base, runs), finish, config=base, seeds=scored)
+    work, before = functools.partial(run, base=base, runs=build.workdir(config, workdir)), common.recordings(rows, base)
+    done = common.fill(path, rows, work, finish, config=base, seeds=scored, launch=launch, before=before)
     print(f"\n{table(done)}\n\n{path}")
     return done
 
@@ -51,7 +57,7 @@ def plan(demos: Sequence[int], seeds: Sequence[int]) -> list[common.Row]:
     return [common.Row(f"{n}-{seed}", f"{n} demonstrations, seed {seed}", (f"data.demos={n}", f"seed={seed}")) for n, seed in pairs]
 
 
-def run(row: common.Row, base, runs: str) -> dict[str, Any]:
+def run(row: common.Row, *, base, runs: str) -> dict[str, Any]:
     """Train one run and score it."""
     config = row.configs(base)[0]
     fields = common.train_and_score(config, pathlib.Path(f"{runs}-{row.name}"))
@@ -98,4 +104,6 @@ def command(argv: Sequence[str] | None = None):
 
 
 if __name__ == "__main__":
-    command()
+    from experiments import main_table as module  # the name under which workers find what they are sent
+
+    module.command()

@@ -3,12 +3,12 @@
 Each row of `ROWS` is scored with the same weights on the same seeds and compared with the first. Writes `robustness-<split>.json` to
 `--out`, experiments/results/<task> unless told, and prints a table. The file is as `common` says; each row's `drop` is the first row's
 score less its own, and `conditions` is what `lala_jax.publish --robustness` reads. Started again, it goes on with the rows that are
-missing; `--rows=moved,noise` runs only these.
+missing; `--rows=moved,noise` runs only these. With `--launcher=slurm` or `local` each row is a worker's (see `lala_jax.cluster`).
 """
 
 from __future__ import annotations
 
-import collections
+import functools
 import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -17,7 +17,8 @@ import jax
 import numpy as np
 
 from experiments import common
-from lala_jax import build, evaluate, options, publish, rollout
+from lala_jax import build, cluster, evaluate, options, publish, rollout
+from lala_jax import checkpoint as checkpoints
 from lala_jax.sim import oracle
 from lala_jax.sim.tasks import base
 
@@ -32,49 +33,49 @@ ROWS = (
     common.Row("distractors", "two objects that the goal does not show", ("task.distractors=2",)),
     *(common.Row(f"tower-{n}", f"towers of {n}", (f"task.num_objects={n}",), tasks=("tower",)) for n in (3, 4, 6)),
 )
-COUNTS = ("actions_by_cause", "first_failures", "lost_objects", "failures_by_reason")  # of a summary
-FLAGS = {"checkpoint": "", "split": "test", "start": 0, "episodes": 100, "rows": "", "out": ""}
+FLAGS = {"checkpoint": "", "split": "test", "start": 0, "episodes": 100, "rows": "", "out": "", **cluster.FLAGS}
 
 
-def main(config, workdir, *, checkpoint: str, split: str, start: int, episodes: int, rows: str, out: str) -> list[dict[str, Any]]:
+def main(
+    config, workdir, *, checkpoint: str, split: str, start: int, episodes: int, rows: str, out: str, launcher: str, launcher_options: str
+) -> list[dict[str, Any]]:
     """Score a checkpoint in the worlds of `ROWS`."""
     del workdir
-    name, seeds = config.task.name, build.split_seeds(split, start, episodes)
+    launch, name, seeds = cluster.launcher(launcher, launcher_options), config.task.name, build.split_seeds(split, start, episodes)
     params, weights = common.load_weights(checkpoint, config)
     chosen = common.choose(ROWS, rows, name)
     paired = {row.name: same_scenes(config, row.configs(config)[0], seeds) for row in chosen}
 
     def finish(done: Sequence[dict[str, Any]], kept: Sequence[dict[str, Any]]) -> dict[str, Any]:
-        for row in done[1:]:
+        for row in done[1:] if done[0]["name"] == chosen[0].name else ():
             row["drop"] = common.difference(done[0]["scores"], row["scores"], paired=paired[row["name"]])
         conditions = {row["label"]: {field: row[field] for field in publish.SCORE} for row in kept}
-        return {"task": name, "split": split, "checkpoint": checkpoint, "reference": done[0]["name"], "conditions": conditions}
+        return {"task": name, "split": split, "checkpoint": checkpoint, "reference": chosen[0].name, "conditions": conditions}
 
     path = pathlib.Path(out or f"experiments/results/{name}") / f"robustness-{split}.json"
-    done = common.fill(path, chosen, lambda row: run(row, config, params, seeds), finish, config=config, seeds=seeds, weights=weights)
+    loaded = params if launch is None else None
+    work = functools.partial(run, base=config, checkpoint=checkpoint, weights=weights, seeds=seeds, params=loaded)
+    done = common.fill(path, chosen, work, finish, config=config, seeds=seeds, weights=weights, launch=launch)
     print(f"\n{table(done)}\n\n{path}")
     return done
 
 
-def run(row: common.Row, config, params, seeds: Sequence[int]) -> dict[str, Any]:
-    """Score one row: each part on its share of the seeds."""
-    parts = zip(row.configs(config), shares(seeds, len(row.parts)), strict=False)  # fewer seeds than parts: the first parts
-    return common.row_of(merged([common.score(one, params, share) for one, share in parts]))
+def run(row: common.Row, *, base, checkpoint: str, weights: Mapping[str, Any], seeds: Sequence[int], params: Any = None) -> dict[str, Any]:
+    """Score one row, each part on its share of the seeds.
+
+    Without `params` reads the checkpoint, and raises CheckpointError where it no longer holds the `weights`.
+    """
+    if params is None:
+        params, found = common.load_weights(checkpoint, base)
+        if found != weights:
+            raise checkpoints.CheckpointError(f"{checkpoint} changed meanwhile: it holds {found}, the other rows scored {weights}")
+    parts = zip(row.configs(base), shares(seeds, len(row.parts)), strict=False)  # fewer seeds than parts: the first parts
+    return common.row_of(rollout.merged([common.score(one, params, share) for one, share in parts]))
 
 
 def shares(seeds: Sequence[int], count: int) -> list[list[int]]:
     """Deal seeds in order to `count` parts as equal as can be."""
     return [part.tolist() for part in np.array_split(np.asarray(seeds), count) if part.size]
-
-
-def merged(summaries: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Give the summary of all episodes from those of parts."""
-    lines = [line for summary in summaries for line in summary["per_episode"]]
-    counts = {name: collections.Counter() for name in COUNTS}
-    for name, counter in counts.items():
-        for summary in summaries:
-            counter.update(summary[name])
-    return {**rollout.head(lines), **{name: dict(counter) for name, counter in counts.items()}, "per_episode": lines}
 
 
 def same_scenes(config, other, seeds: Sequence[int]) -> bool:
@@ -109,4 +110,6 @@ def command(argv: Sequence[str] | None = None):
 
 
 if __name__ == "__main__":
-    command()
+    from experiments import robustness as module  # the name under which workers find what they are sent
+
+    module.command()

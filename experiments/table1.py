@@ -6,12 +6,15 @@ besides), `<scale>.md`, a table of both tasks as far as they are there, and `<sc
 `smoke` (every part, scores that mean nothing), `cpu` (the paper's pictures, maps, crops and widths divided by four, so that a row trains
 in half an hour on two cores) and `paper` (its own sizes and optimiser; for a GPU).
 Runs lie in `--workdir`, runs/table1/<task> unless told, each in <scale>-<row>. Started again, it goes on with the rows that are
-missing, and within a row where its training stopped; `--rows=two-stream,ours` runs only these (and the first).
+missing, and within a row where its training stopped; `--rows=two-stream,ours` runs only these (and the first). With
+`--launcher=slurm` or `local` each row is a worker's (see `lala_jax.cluster`), after others recorded the demonstrations and pre-trained the
+backbone that rows share.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib
 import json
 import pathlib
@@ -21,7 +24,7 @@ from typing import Any
 import jax
 
 from experiments import common
-from lala_jax import build, options, pretrain, scoring, state
+from lala_jax import build, cluster, options, pretrain, scoring, state
 from lala_jax.sim import tasks
 
 
@@ -116,28 +119,36 @@ FAMILIES = {
     "cliport": {"smoke": ("model.width=4", "model.stages=3"), **{scale: PAPER[scale] for scale in ("cpu", "paper")}},
     "graph": {"smoke": ("model.width=8",), "cpu": ("model.width=64",), "paper": ("model.width=64", "train.steps=2500")},
 }
-FLAGS = {"task": "tower", "scale": "cpu", "rows": "", "split": "test", "start": 0, "seed": 0, "out": "experiments/results/table1"}
+FLAGS = {
+    "task": "tower",
+    "scale": "cpu",
+    "rows": "",
+    "split": "test",
+    "start": 0,
+    "seed": 0,
+    "out": "experiments/results/table1",
+    **cluster.FLAGS,
+}
 
 
-def main(config, workdir, *, task: str, scale: str, rows: str, split: str, start: int, seed: int, out: str) -> list[dict[str, Any]]:
+def main(
+    config, workdir, *, task: str, scale: str, rows: str, split: str, start: int, seed: int, out: str, launcher: str, launcher_options: str
+) -> list[dict[str, Any]]:
     """Train and score every row of the table at a scale, and write the table and the bars."""
+    launch = cluster.launcher(launcher, launcher_options)
     options.check_choice("--scale", scale, SCALES)
     base = options.override(config, [*shared(config, scale), f"eval.split={split}", f"eval.start={start}", f"seed={seed}"])
-    seeds, runs, out_path = (
-        build.split_seeds(split, start, base.eval.episodes),
-        pathlib.Path(build.workdir(config, workdir)),
-        pathlib.Path(out),
-    )
+    seeds, out_path = build.split_seeds(split, start, base.eval.episodes), pathlib.Path(out)
+    runs = f"{build.workdir(config, workdir)}/{scale}"
     chosen = [row for row in common.choose(plan(scale), rows, task) if can_run(row)]
 
     def finish(done: Sequence[dict[str, Any]], kept: Sequence[dict[str, Any]]) -> dict[str, Any]:
         del done, kept
         return {"task": task, "scale": scale, "split": split}
 
-    def work(row: Entry) -> dict[str, Any]:
-        return {**run(row, base, runs / f"{scale}-{row.name}", seeds), "published": row.published[PUBLISHED.index(task)]}
-
-    done = common.fill(out_path / f"{scale}-{task}.json", chosen, work, finish, config=base, seeds=seeds)
+    work, path = functools.partial(work_on, base=base, runs=runs, seeds=seeds, task=task), out_path / f"{scale}-{task}.json"
+    before = preparations(chosen, base, runs)
+    done = common.fill(path, chosen, work, finish, config=base, seeds=seeds, launch=launch, before=before)
     write(out_path, scale)
     return done
 
@@ -167,6 +178,11 @@ def can_run(row: Entry) -> bool:
     return True
 
 
+def work_on(row: Entry, *, base, runs: str, seeds: Sequence[int], task: str) -> dict[str, Any]:
+    """Train and score a row: its fields, with what was published."""
+    return {**run(row, base, pathlib.Path(f"{runs}-{row.name}"), seeds), "published": row.published[PUBLISHED.index(task)]}
+
+
 def run(row: Entry, base, directory: pathlib.Path, seeds: Sequence[int]) -> dict[str, Any]:
     """Train a row and score it, or score an agent that needs no training."""
     config = row.configs(base)[0]
@@ -175,11 +191,25 @@ def run(row: Entry, base, directory: pathlib.Path, seeds: Sequence[int]) -> dict
         return {**common.row_of(summary), "parameters": None, "samples": 0, "train_seconds": 0.0}
     config = options.override(config, [f"train.eval_every={config.train.steps}", "train.eval_episodes=1", "eval.strips=0"])
     if row.scene:
-        shared_run = directory.with_name(directory.name.removesuffix(row.name) + "backbone")  # of all rows of a scale
-        config.camera.backbone = str(pretrain.pretrain(config, str(shared_run)))
+        config.camera.backbone = backbone(config, directory.with_name(directory.name.removesuffix(row.name) + "backbone"))
     params = jax.eval_shape(build.build_policy(config).init, jax.random.key(0))
     facts = {"parameters": state.parameter_count(params), "samples": config.train.steps * config.train.batch_size}
     return {**common.train_and_score(config, directory), **facts}
+
+
+def backbone(config, directory: pathlib.Path) -> str:
+    """Pre-train the backbone of all rows of a scale, once, and give the file of its weights."""
+    with cluster.exclusive(directory):
+        return str(pretrain.pretrain(config, str(directory)))
+
+
+def preparations(rows: Sequence[Entry], base, runs: str) -> list[common.Before]:
+    """List what rows share: the demonstrations, and the backbone that is pre-trained in the scenes."""
+    found = common.recordings([row for row in rows if row.agent == "policy"], base)
+    if scene := [row for row in rows if row.scene]:
+        call = functools.partial(backbone, scene[0].configs(base)[0], pathlib.Path(f"{runs}-backbone"))
+        found.append(common.Before("the backbone", call, tuple(row.name for row in scene)))
+    return found
 
 
 # The table and the bars
@@ -261,4 +291,6 @@ def command(argv: Sequence[str] | None = None):
 
 
 if __name__ == "__main__":
-    command()
+    from experiments import table1 as module  # the name under which workers find what they are sent
+
+    module.command()

@@ -2,50 +2,58 @@
 
 The config comes from the checkpoint; `--config.camera.preset=paper` and the like change it. `--checkpoint=pretrained/tower` repeats the
 reported score of the weights that ship with the package, and ends with status 1 where it comes out outside the reported interval. The
-agents that need no training are scored with `--config=configs/tower.py --agent=oracle`, `blind` or `top_view`.
+agents that need no training are scored with `--config=configs/tower.py --agent=oracle`, `blind` or `top_view`. With `--launcher=slurm` or
+`local` workers score the episodes in parts (see `cluster`).
 """
 
 from __future__ import annotations
 
 import pathlib
+import shutil
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from lala_jax import build, options, pretrained, scoring, writers
+from lala_jax import build, cluster, options, pretrained, scoring, writers
 
-FLAGS = {"checkpoint": "", "agent": "policy", "split": "", "start": -1, "episodes": 0}
+FLAGS = {"checkpoint": "", "agent": "policy", "split": "", "start": -1, "episodes": 0, **cluster.FLAGS}
 NO_CHECKPOINT = "give --checkpoint=PATH, or --config=FILE.py with --agent=oracle, blind or top_view"
 
 
-def main(config, workdir, *, checkpoint: str, agent: str, split: str, start: int, episodes: int) -> dict[str, Any]:
+def main(
+    config, workdir, *, checkpoint: str, agent: str, split: str, start: int, episodes: int, launcher: str, launcher_options: str
+) -> dict[str, Any]:
     """Score the checkpoint, or an agent that needs no training, and write scores and pictures to the work directory."""
     options.check_choice("--agent", agent, scoring.AGENTS)
-    split, threads, strips = split or config.eval.split, config.data.threads, {}
+    launch, split = cluster.launcher(launcher, launcher_options), split or config.eval.split
     seeds = build.split_seeds(split, start if start >= 0 else config.eval.start, episodes or config.eval.episodes)
+    out = pathlib.Path(build.workdir(config, workdir))
+    parts = out / f"scores-{agent}-{split}.parts"
+    result, strips = score(config, checkpoint, agent, seeds, launch, parts)
+    scoring.write_scores(config, result, strips, out, agent=agent, split=split, seeds=seeds, source=checkpoint or None)
+    if launch is not None:
+        shutil.rmtree(parts)
+    if agent == "policy" and not reproduced(checkpoint, config, split=split, seeds=seeds, result=result):
+        raise SystemExit(1)
+    return result
+
+
+def score(config, checkpoint: str, agent: str, seeds: Sequence[int], launch: cluster.Launcher | None, parts: pathlib.Path):
+    """Score here or by workers, which leave parts: the summary and the pictures."""
+    weights = None
     if agent == "policy":
         if not checkpoint:
             raise options.OptionsError(NO_CHECKPOINT)
         built, observer = build.build_policy(config), build.observer(config)
         params = scoring.check_checkpoint(checkpoint, config, built)
-        result, strips = scoring.evaluate(
-            built, params, observer, seeds=seeds, parallel=config.eval.parallel, threads=threads,
-            strips=config.eval.strips, seed=config.seed, progress=lambda done, total: print(f"{done} of {total} episodes", flush=True),
-        )  # fmt: skip
-    else:
-        result = scoring.baseline(agent, build.task(config), seeds=seeds, threads=threads)
-    scoring.write_scores(
-        config,
-        result,
-        strips,
-        pathlib.Path(build.workdir(config, workdir)),
-        agent=agent,
-        split=split,
-        seeds=seeds,
-        source=checkpoint or None,
-    )
-    if agent == "policy" and not reproduced(checkpoint, config, split=split, seeds=seeds, result=result):
-        raise SystemExit(1)
-    return result
+        if launch is None:
+            return scoring.evaluate(
+                built, params, observer, seeds=seeds, parallel=config.eval.parallel, threads=config.data.threads,
+                strips=config.eval.strips, seed=config.seed, progress=lambda done, total: print(f"{done} of {total} episodes", flush=True),
+            )  # fmt: skip
+        weights = scoring.fingerprint(checkpoint, params)
+    if launch is None:
+        return scoring.baseline(agent, build.task(config), seeds=seeds, threads=config.data.threads), {}
+    return scoring.evaluate_in_parts(launch, config, parts, agent=agent, path=checkpoint, weights=weights, seeds=seeds)
 
 
 def reproduced(path: str, config, *, split: str, seeds: Sequence[int], result: Mapping[str, Any]) -> bool:

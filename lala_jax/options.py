@@ -103,7 +103,8 @@ def run(
     """Parse the command line and call `main(config, workdir, **flags)`; what it returns is returned.
 
     Args:
-      flags: further flags with their defaults, whose types they keep: `{"checkpoint": ""}` makes `--checkpoint=PATH`.
+      flags: further flags with their defaults, whose types they keep: `{"checkpoint": ""}` makes `--checkpoint=PATH`; an underscore is
+        a hyphen there.
       config_from: gives the config from the flags when `--config` is not given (say, the one stored in a checkpoint);
         `--config.x=y` then changes that one. Without it `--config` is required.
       workdir: default of `--workdir`, which is required without one.
@@ -284,20 +285,21 @@ def _parse(argv: Sequence[str], flags: dict[str, Any]) -> dict[str, Any]:
             given["help"] = True
             continue
         name, equals, value = token.removeprefix("--").partition("=")
+        name = name.replace("-", "_") if name.replace("-", "_") in flags else name
         if not token.startswith("--") or not (name in ("config", "workdir", *flags) or name.startswith("config.")):
-            valid = ["--config", "--workdir", *(f"--{flag}" for flag in flags)]
+            valid = ["--config", "--workdir", *(f"--{flag.replace('_', '-')}" for flag in flags)]
             hint = _suggest(token.partition("=")[0], valid)
             raise OptionsError(f"unknown argument {token!r}{hint}\n" + _wrap(f"valid: {', '.join(valid)}, --config.FIELD=VALUE"))
         if not equals:
             if not rest or rest[0].startswith("--"):
-                raise OptionsError(f"--{name} needs a value: --{name}=VALUE")
+                raise OptionsError(f"{token} needs a value: {token}=VALUE")
             value = rest.pop(0)
         if name.startswith("config."):
             given["overrides"].append(f"{name.removeprefix('config.')}={value}")
         elif name in ("config", "workdir"):
             given[name] = value
         else:
-            given["flags"][name] = _convert(f"--{name}", value, flags[name], type(flags[name]))
+            given["flags"][name] = _convert(f"--{name.replace('_', '-')}", value, flags[name], type(flags[name]))
     return given
 
 
@@ -305,7 +307,7 @@ def _usage(program: str, main: Callable[..., Any], flags: dict[str, Any], config
     """Compose the help text, with the fields of `config` where one is named."""
     lines = [f"usage: python -m {program} --config=FILE.py[:ARGUMENT] --workdir=DIRECTORY [--config.FIELD=VALUE ...]"]
     lines += [inspect.getdoc(main) or ""]
-    lines += [f"  --{name}={default!r}" for name, default in flags.items()]
+    lines += [f"  --{name.replace('_', '-')}={default!r}" for name, default in flags.items()]
     if config is not None:
         lines += [f"  --config.{name}={value!r}" for name, value in fields(load(config)).items()]
     return "\n".join(line for line in lines if line)

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import collections
+import functools
 import math
 import pathlib
-from collections.abc import Mapping
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from rich import progress
 
-from lala_jax import build, dataset, rollout
+from lala_jax import build, cluster, dataset, rollout, types
 from lala_jax.sim.tasks import base
 
 SHARD = 10  # demonstrations written at a time
@@ -18,11 +21,12 @@ PATIENCE = 8.0  # further actions granted for each spoiled one that is expected
 MIN_SCORE = 99.0  # a demonstration below is not kept
 
 
-def collect(config: Mapping[str, Any], *, quiet: bool = False) -> pathlib.Path:
+def collect(config: Mapping[str, Any], *, quiet: bool = False, launch: cluster.Launcher | None = None) -> pathlib.Path:
     """Complete the dataset of the config to `data.demos` demonstrations of train seeds and give its directory.
 
-    Goes on where an earlier run stopped; a directory that has enough is left alone. Raises `dataset.DatasetError` where the
-    directory holds another task, `options.OptionsError` where the train split runs out of seeds.
+    Goes on where an earlier run stopped; a directory that has enough is left alone. With `launch` workers record the shards, and the
+    files are the same. Raises `dataset.DatasetError` where the directory holds another task, `options.OptionsError` where the train
+    split runs out of seeds.
     """
     task, wanted = build.task(config), config["data"]["demos"]
     directory = pathlib.Path(config["data"]["directory"])
@@ -34,17 +38,67 @@ def collect(config: Mapping[str, Any], *, quiet: bool = False) -> pathlib.Path:
     if kept >= wanted:
         return directory
     columns = (*progress.Progress.get_default_columns(), progress.MofNCompleteColumn())
-    with progress.Progress(*columns, disable=quiet) as bar:
+    with progress.Progress(*columns, disable=quiet or launch is not None) as bar:
         shown = bar.add_task(f"demonstrations of {task.name}", total=wanted, completed=kept)
         while kept < wanted:
-            seeds = build.split_seeds("train", place, min(SHARD, wanted - kept))
-            place += len(seeds)
-            demos = demonstrate(task, seeds, threads=config["data"]["threads"], mistakes=build.mistakes(config))
-            if demos:
-                dataset.append(directory, demos, **identity)
-            kept += len(demos)
-            bar.update(shown, completed=kept)
+            shards = plan(place, wanted - kept if launch is not None else min(SHARD, wanted - kept))
+            for seeds, demos in _record(config, shards, launch):
+                if len(seeds) != min(SHARD, wanted - kept):
+                    break  # fewer were kept than planned, so that this shard would be larger
+                place += len(seeds)
+                if demos:
+                    dataset.append(directory, demos, **identity)
+                kept += len(demos)
+                bar.update(shown, completed=kept)
+    if launch is not None:
+        shutil.rmtree(_parts(directory))
     return directory
+
+
+def plan(place: int, count: int) -> list[list[int]]:
+    """List the seeds of the shards for `count` more demonstrations from a place in the train split on, if all are kept."""
+    return [build.split_seeds("train", place + done, min(SHARD, count - done)) for done in range(0, count, SHARD)]
+
+
+def _record(config, shards, launch: cluster.Launcher | None) -> Iterator[tuple[list[int], list[types.Demo]]]:
+    """Yield the shards' seeds and demonstrations in order."""
+    if launch is None:
+        yield from ((seeds, _demonstrations(config, seeds)) for seeds in shards)
+        return
+    folder, tasks, places, waiting = _parts(pathlib.Path(config["data"]["directory"])), [], {}, collections.deque(shards)
+    key = {"task": config["task"]["name"], "task_options": build.task_options(config)}
+    for group in np.array_split(np.arange(len(shards)), min(launch.workers, len(shards))):
+        own = [shards[index] for index in group]
+        name = f"{own[0][0]}-{own[-1][-1]}"
+        call = functools.partial(record_shards, config, own, folder / name)
+        tasks.append(cluster.Task(f"seeds {name}", call, folder / f"{name}.json", {**key, "shards": own}))
+        places |= {seeds[0]: folder / name / str(seeds[0]) for seeds in own}
+    counts: dict[int, int] = {}
+    for _, found in cluster.run(launch, tasks, folder):
+        counts |= {int(first): count for first, count in found.items()}
+        while waiting and waiting[0][0] in counts:
+            seeds = waiting.popleft()
+            yield seeds, dataset.load(places[seeds[0]])[0] if counts[seeds[0]] else []
+
+
+def record_shards(config: Mapping[str, Any], shards: Sequence[list[int]], folder: pathlib.Path) -> dict[int, int]:
+    """Record shards in a worker, each as a dataset `<folder>/<first seed>`: the number of demonstrations in each, by first seed."""
+    counts = {}
+    for seeds in shards:
+        shutil.rmtree(folder / str(seeds[0]), ignore_errors=True)  # of a worker that was killed
+        demos = _demonstrations(config, seeds)
+        if demos:
+            dataset.save(folder / str(seeds[0]), demos, task=config["task"]["name"], task_options=build.task_options(config))
+        counts[seeds[0]] = len(demos)
+    return counts
+
+
+def _parts(directory: pathlib.Path) -> pathlib.Path:
+    return directory.with_name(directory.name + ".parts")
+
+
+def _demonstrations(config: Mapping[str, Any], seeds: list[int]) -> list[types.Demo]:
+    return demonstrate(build.task(config), seeds, threads=config["data"]["threads"], mistakes=build.mistakes(config))
 
 
 def demonstrate(task: base.Task, seeds: list[int], *, threads: int, mistakes: float = 0.0) -> list:

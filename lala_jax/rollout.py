@@ -19,6 +19,7 @@ from lala_jax.sim.tasks import base
 Agent = Callable[[Sequence[int], np.ndarray], Sequence[types.PickPlace | None]]
 
 CAUSES = ("right", "missed pick", "lost on the way", "wrong object", "knocked over", "wrong yaw", "wrong height", "wrong place")
+COUNTS = ("actions_by_cause", "first_failures", "lost_objects", "failures_by_reason")  # of a summary
 
 
 @dataclasses.dataclass
@@ -200,3 +201,13 @@ def summary(episodes: Sequence[Episode]) -> dict:
         "failures_by_reason": dict(reasons),
         "per_episode": lines,
     }
+
+
+def merged(summaries: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Give the summary of all episodes from those of parts."""
+    lines = [line for one in summaries for line in one["per_episode"]]
+    counts = {name: collections.Counter() for name in COUNTS}
+    for name, counter in counts.items():
+        for one in summaries:
+            counter.update(one[name])
+    return {**head(lines), **{name: dict(counter) for name, counter in counts.items()}, "per_episode": lines}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import pathlib
+import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -11,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lala_jax import build, checkpoint, compiling, observe, options, pictures, policy, pretrained, rollout, types, writers
+from lala_jax import build, checkpoint, cluster, compiling, observe, options, pictures, policy, pretrained, rollout, types, writers
 from lala_jax.sim import oracle
 
 AGENTS = ("policy", *oracle.AGENTS)
@@ -90,15 +91,17 @@ class PolicyAgent:
 
 def evaluate(
     agent: policy.Policy, params: Any, observer: observe.Observer, *, seeds: Sequence[int], parallel: int, threads: int, strips: int = 0,
-    seed: int = 0, progress=None,
+    seed: int = 0, progress=None, places: range | None = None,
 ) -> tuple[dict[str, Any], dict[tuple[str, int], np.ndarray]]:  # fmt: skip
     """Run the closed loop on `seeds` with the real primitive: `(rollout.summary, pictures)`.
 
     The first `strips` episodes are drawn, as `("episode", 0)` and so on, and, where any are, the first `FAILURES` that score below 100,
-    as `("failure", 0)` and so on.
+    as `("failure", 0)` and so on. With `places`, one of `spans`, only the seeds at these are run, bit for bit as
+    among all; failures are then numbered within.
     """
     task, parallel, episodes, drawn, failed = observer.task, min(parallel, len(seeds)), [], {}, 0
-    for start in range(0, len(seeds), parallel):
+    places = range(len(seeds)) if places is None else places
+    for start in range(places.start, places.stop, parallel):
         chunk = list(seeds[start : start + parallel])
         scenes = [task.sample(s) for s in chunk]
         actor = PolicyAgent(agent, params, observer, scenes, parallel=parallel, key=jax.random.fold_in(jax.random.key(seed), start))
@@ -112,8 +115,15 @@ def evaluate(
         drawn |= {name: strip[i] for name, i in names.items()}
         episodes += done
         if progress is not None:
-            progress(len(episodes), len(seeds))
+            progress(len(episodes), len(places))
     return rollout.summary(episodes), drawn
+
+
+def spans(count: int, parallel: int, most: int) -> list[range]:
+    """Split the places of `count` episodes into at most `most` ranges of whole chunks, of which each is observed at once."""
+    starts = range(0, count, min(parallel, count))
+    groups = np.array_split(starts, min(most, len(starts)))
+    return [range(int(own[0]), min(int(own[-1]) + starts.step, count)) for own in groups]
 
 
 def baseline(name: str, observer_task, *, seeds: Sequence[int], threads: int) -> dict[str, Any]:
@@ -122,6 +132,65 @@ def baseline(name: str, observer_task, *, seeds: Sequence[int], threads: int) ->
     scenes = [observer_task.sample(seed) for seed in seeds]
     agent = rollout.oracle_agent(observer_task, scenes, seeds, name)
     return rollout.summary(rollout.run(observer_task, scenes, seeds, agent, threads=threads))
+
+
+def fingerprint(path: str, params: Any) -> dict[str, Any]:
+    """Say what identifies the weights of a checkpoint: the step, and a checksum of all leaves."""
+    content = b"".join(np.asarray(leaf).tobytes() for _, leaf in sorted(checkpoint.named(params).items()))
+    return {"step": pretrained.describe(path)["step"], "crc32": zlib.crc32(content)}
+
+
+def score_span(
+    config, places: range, pictures_file: pathlib.Path, *, agent: str, path: str, weights: Mapping[str, Any] | None, seeds: Sequence[int]
+) -> dict[str, Any]:
+    """Score an agent at some places of `seeds`, one of `spans`, and leave the pictures in an `.npz`.
+
+    Raises CheckpointError where the checkpoint at `path` no longer holds the `weights`.
+    """
+    if agent != "policy":
+        return baseline(agent, build.task(config), seeds=[seeds[place] for place in places], threads=config.data.threads)
+    built, observer = build.build_policy(config), build.observer(config)
+    params = check_checkpoint(path, config, built)
+    if (now := fingerprint(path, params)) != weights:
+        raise checkpoint.CheckpointError(f"{path} changed meanwhile: it holds {now}, the others scored {weights}")
+    result, drawn = evaluate(
+        built, params, observer, seeds=seeds, parallel=config.eval.parallel, threads=config.data.threads, strips=config.eval.strips,
+        seed=config.seed, progress=lambda done, total: print(f"{done} of {total} episodes", flush=True), places=places,
+    )  # fmt: skip
+    with writers.atomic(pictures_file) as file:
+        np.savez(file, **{f"{kind}-{number}": picture for (kind, number), picture in drawn.items()})
+    return result
+
+
+def evaluate_in_parts(launch: cluster.Launcher, config, folder: pathlib.Path, **what) -> tuple[dict[str, Any], dict[tuple[str, int], Any]]:
+    """Give what `evaluate`, or `baseline`, gives, scored by workers; the parts stay in `folder` until the caller is done with them.
+
+    `what` says what is scored: `agent`, `path`, `weights` and `seeds` of `score_span`.
+    """
+    count, tasks = len(what["seeds"]), []
+    for places in spans(count, config.eval.parallel, launch.workers):
+        name = f"{places.start}-{places.stop - 1}"
+        call = functools.partial(score_span, config, places, folder / f"{name}.npz", **what)
+        key = {**what, "config": options.to_dict(config), "places": [places.start, places.stop]}
+        tasks.append(cluster.Task(f"episodes {name}", call, folder / f"{name}.json", key))
+    found = dict(cluster.run(launch, tasks, folder))
+    drawn = _gathered([task.part.with_suffix(".npz") for task in tasks]) if what["agent"] == "policy" else {}
+    return rollout.merged([found[task.name] for task in tasks]), drawn
+
+
+def _gathered(files: Sequence[pathlib.Path]) -> dict[tuple[str, int], np.ndarray]:
+    """Read the pictures of parts in order, numbering failures anew."""
+    drawn, failed = {}, 0
+    for file in files:
+        with np.load(file) as archive:
+            for name in archive.files:
+                kind, _, number = name.partition("-")
+                if kind == "episode":
+                    drawn[kind, int(number)] = archive[name]
+                elif failed < FAILURES:
+                    drawn[kind, failed] = archive[name]
+                    failed += 1
+    return drawn
 
 
 def episode_pictures(actor: PolicyAgent, episodes: Mapping[int, rollout.Episode]) -> dict[int, np.ndarray]:

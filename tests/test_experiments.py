@@ -170,8 +170,8 @@ def test_merged_quarters_equal_one_summary():
     scenes = [task.sample(6)]
     episodes += rollout.run(task, scenes, [6], rollout.oracle_agent(task, scenes, [6], "blind"), threads=1)
     parts = [[episodes[i] for i in share] for share in robustness.shares(range(4), 3)]
-    assert robustness.merged([rollout.summary(part) for part in parts]) == rollout.summary(episodes)
-    assert robustness.merged([rollout.summary(episodes)]) == rollout.summary(episodes)
+    assert rollout.merged([rollout.summary(part) for part in parts]) == rollout.summary(episodes)
+    assert rollout.merged([rollout.summary(episodes)]) == rollout.summary(episodes)
     row = common.row_of(rollout.summary(episodes))
     assert row["scores"]["4"] == 0 and list(row["scores"]) == ["0", "2", "4", "6"] and "per_episode" not in row
 
@@ -218,7 +218,7 @@ def trains(monkeypatch):
 
 def told(seeds, score):
     lines = [{"seed": s, "score": score + s % 4, "complete": False, "actions": 1, "causes": ["wrong yaw"]} for s in seeds]
-    return robustness.merged([{"per_episode": lines, **{name: {"wrong yaw": len(seeds)} for name in robustness.COUNTS}}])
+    return rollout.merged([{"per_episode": lines, **{name: {"wrong yaw": len(seeds)} for name in rollout.COUNTS}}])
 
 
 def test_the_ablation_trains_each_row_once(trains, monkeypatch, tmp_path, capsys):

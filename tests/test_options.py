@@ -174,6 +174,9 @@ def test_run_calls_main(file):
     stored = {"train": {"steps": 4}}
     got = options.run(main, flags=flags, config_from=lambda flags: stored, workdir="out", argv=["--config.train.steps=8"])
     assert got == (8, "out", "", 5)
+    for argument in ("--of-two=4", "--of_two=4"):
+        given = options.run(lambda *_, of_two: of_two, flags={"of_two": 5}, workdir="out", argv=[f"--config={file}", argument])
+        assert given == 4
 
 
 @pytest.mark.parametrize(
