@@ -6,9 +6,10 @@ besides), `<scale>.md`, a table of both tasks as far as they are there, and `<sc
 `smoke` (every part, scores that mean nothing), `cpu` (the paper's pictures, maps, crops and widths divided by four, so that a row trains
 in half an hour on two cores) and `paper` (its own sizes and optimiser; for a GPU).
 Runs lie in `--workdir`, runs/table1/<task> unless told, each in <scale>-<row>. Started again, it goes on with the rows that are
-missing, and within a row where its training stopped; `--rows=two-stream,ours` runs only these (and the first). With
-`--launcher=slurm` or `local` each row is a worker's (see `lala_jax.cluster`), after others recorded the demonstrations and pre-trained the
-backbone that rows share.
+missing, and within a row where its training stopped; `--rows=two-stream,ours` runs only these (and the first). The row `cliport-clip`
+needs CLIP's own weights: `--clip=RN50.safetensors --clip-tokenizer=tokenizer.json`, which `clip_file` reads. With `--launcher=slurm` or
+`local` each row is a worker's (see `lala_jax.cluster`), after others recorded the demonstrations and pre-trained the backbone that rows
+share.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ class Entry(common.Row):
     few: bool = False  # learns from FEW demonstrations
     scene: bool = False  # the backbone is first pre-trained in the task's scenes
     extra: str = ""  # of the package, with a module of that name, that the row needs
+    clip: bool = False  # needs CLIP's files
 
 
 HIDDEN = ("model.max_height=true", "model.multi_action=false", "camera.backbone=resnet50_imagenet_v1")  # the goal's inside is
@@ -62,6 +64,15 @@ ROWS = (
         published=(27.0, None),
         family="cliport",
         extra="language",
+    ),
+    Entry(
+        "cliport-clip",
+        "CLIPort with CLIP's own weights",
+        ("model.name=cliport", *COLOR, "augment.mix=0.0"),
+        tasks=("tower",),
+        published=(27.0, None),
+        family="clip",
+        clip=True,
     ),
     Entry("graph", "graph policy on true poses", ("model.name=graph",), family="graph"),
     Entry("two-stream-plain", "two stream, no pretrained features", ("model.name=two_stream", *COLOR)),
@@ -117,30 +128,36 @@ FAMILIES = {
     },
     "paper": PAPER,
     "cliport": {"smoke": ("model.width=4", "model.stages=3"), **{scale: PAPER[scale] for scale in ("cpu", "paper")}},
+    # All four stages, to a stride of 32, as in CLIPort.
+    "clip": {
+        "smoke": ("model.width=4", "model.stages=5", "model.crop=32"),
+        "cpu": (*PAPER["cpu"], "model.stages=5", "model.crop=32"),
+        "paper": (*PAPER["paper"], "model.stages=5"),
+    },
     "graph": {"smoke": ("model.width=8",), "cpu": ("model.width=64",), "paper": ("model.width=64", "train.steps=2500")},
 }
 FLAGS = {
-    "task": "tower",
-    "scale": "cpu",
-    "rows": "",
-    "split": "test",
-    "start": 0,
-    "seed": 0,
-    "out": "experiments/results/table1",
+    **{"task": "tower", "scale": "cpu", "rows": "", "split": "test", "start": 0, "seed": 0, "out": "experiments/results/table1"},
+    **{"clip": "", "clip_tokenizer": ""},
     **cluster.FLAGS,
 }
 
 
 def main(
-    config, workdir, *, task: str, scale: str, rows: str, split: str, start: int, seed: int, out: str, launcher: str, launcher_options: str
-) -> list[dict[str, Any]]:
+    config, workdir, *, task: str, scale: str, rows: str, split: str, start: int, seed: int, out: str, clip: str, clip_tokenizer: str,
+    launcher: str, launcher_options: str,
+) -> list[dict[str, Any]]:  # fmt: skip
     """Train and score every row of the table at a scale, and write the table and the bars."""
     launch = cluster.launcher(launcher, launcher_options)
     options.check_choice("--scale", scale, SCALES)
     base = options.override(config, [*shared(config, scale), f"eval.split={split}", f"eval.start={start}", f"seed={seed}"])
     seeds, out_path = build.split_seeds(split, start, base.eval.episodes), pathlib.Path(out)
     runs = f"{build.workdir(config, workdir)}/{scale}"
-    chosen = [row for row in common.choose(plan(scale), rows, task) if can_run(row)]
+    files = tuple(f"model.{name}={path}" for name, path in (("clip", clip), ("clip_tokenizer", clip_tokenizer)) if path)
+    chosen = [row for row in common.choose(plan(scale, files), rows, task) if can_run(row, files)]
+    for row in chosen:
+        if row.clip:
+            build.build_policy(row.configs(base)[0])  # before hours of other rows, whether the files will do
 
     def finish(done: Sequence[dict[str, Any]], kept: Sequence[dict[str, Any]]) -> dict[str, Any]:
         del done, kept
@@ -161,14 +178,19 @@ def shared(config, scale: str) -> list[str]:
     return [text.format(config=config) for text in SCALES[scale]]
 
 
-def plan(scale: str) -> list[Entry]:
-    """List the rows with all overrides of a scale: the family's sizes first, then what the row is."""
-    few = {True: (f"data.demos={FEW[scale]}",), False: ()}
-    return [dataclasses.replace(row, overrides=(*FAMILIES[row.family][scale], *few[row.few], *row.overrides)) for row in ROWS]
+def plan(scale: str, clip: tuple[str, ...] = ()) -> list[Entry]:
+    """List the rows with all overrides of a scale: the family's sizes first, then what the row is, then CLIP's files if it needs them."""
+    few, files = {True: (f"data.demos={FEW[scale]}",), False: ()}, {True: clip, False: ()}
+    return [
+        dataclasses.replace(row, overrides=(*FAMILIES[row.family][scale], *few[row.few], *row.overrides, *files[row.clip])) for row in ROWS
+    ]
 
 
-def can_run(row: Entry) -> bool:
-    """Say whether what a row needs is installed, and print it where not."""
+def can_run(row: Entry, clip: tuple[str, ...] = ()) -> bool:
+    """Say whether what a row needs is installed, or was given, and print it where not."""
+    if row.clip and not clip:
+        print(f"{row.name} is left out: it needs --clip=PATH, CLIP's weights, and --clip-tokenizer=PATH, a tokenizer.json", flush=True)
+        return False
     try:
         if row.extra:
             importlib.import_module(f"lala_jax.{row.extra}")

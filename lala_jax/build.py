@@ -2,23 +2,34 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Mapping
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from lala_jax import backbone, checkpoint, dataset, observe, optim, options, policy, policy_cliport, pretrain_step, train_step, types
-from lala_jax.models import bert, cliport, cross_view, goal_aware, graph, resnet, transporter
+from lala_jax import (
+    backbone,
+    checkpoint,
+    dataset,
+    encoders,
+    observe,
+    optim,
+    options,
+    policy,
+    policy_cliport,
+    pretrain_step,
+    train_step,
+    types,
+)
+from lala_jax.models import cliport, cross_view, goal_aware, graph, resnet, transporter
 from lala_jax.sim import scene, tasks
 from lala_jax.sim.tasks import base
 
 MODELS = ("goal_aware", *transporter.VARIANTS, "cliport", "graph")
-TRUNK = "resnet50_imagenet_v1"  # of cliport
-NEWER = {"augment.mix": 0.5}  # what configs in checkpoints that are older than a field mean
+CLIP_STAGES = (2, 3, 4)  # of CLIP's trunk, that cliport may take
+# What configs in checkpoints that are older than a field mean.
+NEWER = {"augment.mix": 0.5, "model.clip": "", "model.clip_tokenizer": "", "model.clip_stages": 0}
 SPLITS = ("train", "val", "test")
 TEST_START = 10_001
 WORKDIR = "runs/<task>"  # the default of --workdir
@@ -93,6 +104,7 @@ def build_policy(config: Mapping[str, Any]) -> policy.Policy:
     """Build the policy from the groups `model` and `map`."""
     fields, spec = config["model"], map_spec(config)
     options.check_choice("model.name", fields["name"], MODELS)
+    files = clip_files(config)
     for name in ("rotations", "crop", "channels", "width", "stages", "trunk_width", "tokens"):
         _positive(f"model.{name}", fields[name])
     shared = {"crop": fields["crop"], "channels": fields["channels"]}
@@ -116,31 +128,34 @@ def build_policy(config: Mapping[str, Any]) -> policy.Policy:
     try:
         if fields["name"] == "cliport":
             built = task(config)
-            told = encoders(built.name, built.num_objects)
-            return policy_cliport.CliportPolicy(model=cliport.Cliport(**shared), spec=spec, **told, **choices)
+            told = encoders.load(built.name, built.num_objects, **files)
+            return policy_cliport.CliportPolicy(model=cliport.Cliport(**shared, text_layer=not files), spec=spec, **told, **choices)
         net = transporter.Transporter(variant=fields["name"], **shared)
         return policy.TransporterPolicy(model=net, spec=spec, surface=surface(config), **choices)
     except ValueError as error:
         raise options.OptionsError(str(error)) from error
 
 
-@functools.lru_cache(maxsize=1)
-def encoders(task_name: str, count: int) -> dict[str, Any]:
-    """Load what `policy_cliport` takes as others trained it, for a task's sentences of `count` objects: `trunk`, `encoder`, `weights`."""
-    known = [name for name in tasks.names() if hasattr(tasks.get(name), "sentence")]
-    if task_name not in known:
-        raise options.OptionsError(f"model.name 'cliport' needs a task.name with a sentence: {', '.join(known)}, got {task_name!r}")
-    try:
-        from lala_jax import language  # needs an extra
-    except ModuleNotFoundError as error:
-        raise options.OptionsError(f"model.name 'cliport' is not installed: {error}") from error
-    trunk, variables = backbone.load(TRUNK, stage=policy_cliport.STAGES[-1])
-    encoder, template = bert.Bert(), language.template(task_name, count)
-    palette = np.array(list(base.COLORS.values()), np.float32) / 255
-    variables, words = jax.tree.map(jnp.asarray, (variables, language.load()))
-    centre = policy_cliport.mean_sentence(encoder, words, template, colors=len(palette))
-    weights = policy_cliport.Frozen(variables, words, template, jnp.asarray(palette), centre)
-    return {"trunk": trunk, "encoder": encoder, "weights": weights}
+def clip_files(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Give CLIP's `weights`, its `tokenizer` and how many `stages` of its trunk cliport takes, where the config names its files."""
+    fields = config["model"]
+    weights, tokenizer, stages = (fields.get(name, NEWER[f"model.{name}"]) for name in ("clip", "clip_tokenizer", "clip_stages"))
+    if not (weights or tokenizer or stages):
+        return {}
+    if fields["name"] != "cliport":
+        raise options.OptionsError(f"model.name {fields['name']!r} takes no model.clip: 'cliport' does")
+    if not (weights and tokenizer):
+        given = f"{weights!r} and {tokenizer!r}"
+        raise options.OptionsError(f"model.clip, the weights, and model.clip_tokenizer, a tokenizer.json, go together, got {given}")
+    options.check_choice("model.clip_stages", stages, (0, *CLIP_STAGES))
+    fitting = min(fields["stages"] - 1, (fields["crop"] & -fields["crop"]).bit_length() - 2)  # the power of two in the crop
+    return {"weights": weights, "tokenizer": tokenizer, "stages": stages or min(max(fitting, CLIP_STAGES[0]), CLIP_STAGES[-1])}
+
+
+def clip_identity(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Give the input spec's entry of CLIP's towers, which tells them from others, whatever files they lie in; {} without any."""
+    files, built = clip_files(config), task(config)
+    return {"clip": encoders.identity(built.name, built.num_objects, **files)} if files else {}
 
 
 def _mix(config: Mapping[str, Any]) -> float:
@@ -235,6 +250,7 @@ def input_spec(config: Mapping[str, Any]) -> dict[str, Any]:
     more = {"surface": f"{config['camera']['backbone']} {config['camera']['stage']}"} if surface(config) else {}
     return {
         **more,
+        **clip_identity(config),
         "map": {"rows": spec.rows, "cols": spec.cols, "slices": spec.slices, "features": 3},
         "x": list(spec.x), "y": list(spec.y), "z": list(spec.z), "cell": spec.cell,
         "features": "RGB in 0..1, mean per voxel",

@@ -59,6 +59,9 @@ def get(arg: str, *, task: str) -> ml_collections.ConfigDict:
     config.model.matching = True  # tell pick and place which voxels of the two maps look alike
     config.model.refine = True  # regress below the cell and the bin, and tell quarter turns apart
     config.model.max_height = False  # see only what is highest in each column
+    config.model.clip = ""  # for cliport: a file of CLIP's weights, .safetensors or .npz; none: ImageNet's and MiniLM's
+    config.model.clip_tokenizer = ""  # the tokenizer.json that goes with them
+    config.model.clip_stages = 0  # of CLIP's trunk, 2 to 4 (strides of 8 to 32); 0: as many as crop and stages allow
     config.model.average_turns = False  # act on the mean of the logits of the maps as they are and turned by 180 degrees
 
     config.augment = ml_collections.ConfigDict()

@@ -39,15 +39,24 @@ def mean_metrics(seen: Sequence[Metrics], *, last: int) -> dict[str, float]:
 
 
 def start_or_resume(
-    fresh: state.TrainState, store: checkpoint.Checkpoints, config, settings: Callable[[Mapping[str, Any]], dict[str, Any]]
+    fresh: state.TrainState,
+    store: checkpoint.Checkpoints,
+    config,
+    settings: Callable[[Mapping[str, Any]], dict[str, Any]],
+    frozen: Mapping[str, Any] | None = None,
 ) -> state.TrainState:
-    """Give the newest intact state of the store, or `fresh`; raises CheckpointError where it is of a run with other `settings`."""
+    """Give the newest intact state of the store, or `fresh`; raises CheckpointError where it is of a run with other `settings`.
+
+    `frozen` are entries of the input spec that must be those of the run, too.
+    """
+    frozen = frozen or {}
     fresh = jax.device_put(fresh, jax.devices()[0])  # committed to it, as what is restored: both then run one compiled step
     found = store.restore_latest(fresh)
     if found is None:
         return fresh
-    there = settings(checkpoint.describe(store.directory / "latest" / str(found[0]))["config"])
-    here = settings(writers.plain(options.to_dict(config)))
+    stored = checkpoint.describe(store.directory / "latest" / str(found[0]))
+    there = settings(stored["config"]) | options.fields({name: stored["input_spec"].get(name, {}) for name in frozen})
+    here = settings(writers.plain(options.to_dict(config))) | options.fields(frozen)
     if changed := options.differences(there, here):
         raise checkpoint.CheckpointError(f"{store.directory} holds a run with another {', '.join(changed)}: choose another --workdir")
     return found[1]

@@ -4,19 +4,20 @@ import json
 import sys
 
 import clip_reference
+import clip_tokens
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from safetensors import numpy as safetensors
 
-from lala_jax import checkpoint, clip_file
+from lala_jax import checkpoint, clip_file, wording
 from lala_jax.models import clip
+from lala_jax.sim.tasks import base
 
 SIZES = {"blocks": (1, 1, 1, 1), "width": 2, "side": 32, "embed": 3, "vocab": 5, "positions": 4, "text_width": 4, "layers": 1}
-NET = clip.Clip(clip.Visual((1, 1, 1, 1), 2), clip.Pool(1, 2, 3), clip.Text(5, 4, 4, 1, 2, 3))
+NET = clip.Clip(clip.Visual((1, 1, 1, 1), 2), clip.Pool(1, 1, 3), clip.Text(5, 4, 4, 1, 1, 3))
 BESIDES = {"visual.bn1.num_batches_tracked": np.array(7), "input_resolution": np.array(32), "vocab_size": np.array(5)}
-START, END = "<|startoftext|>", "<|endoftext|>"
-MERGES = ["r e", "re d</w>", "b l", "o c", "bl oc", "k s</w>", "bloc ks</w>", "b lu", "l u", "' s</w>"]
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +37,8 @@ def write(path, tensors):
 @pytest.mark.parametrize("suffix", [".safetensors", ".npz"])
 def test_a_file_gives_its_values_in_float32(state, tmp_path, suffix, dtype):
     stored = {name: tensor.astype(dtype) for name, tensor in state.items()}
-    found = clip_file.load(write(tmp_path / f"RN50{suffix}", stored | BESIDES), NET)
+    net, found = clip_file.load(write(tmp_path / f"RN50{suffix}", stored | BESIDES))
+    assert net == NET
     exact = {name: tensor.astype(np.float32) for name, tensor in stored.items()}
     jax.tree.map(np.testing.assert_array_equal, found, clip.from_published(exact, NET))
     assert {leaf.dtype for leaf in jax.tree.leaves(found)} == {np.dtype(np.float32)}
@@ -51,67 +53,56 @@ def test_what_is_no_file_of_rn50(state, tmp_path):
             clip_file.load(tmp_path / name)
     with pytest.raises(checkpoint.CheckpointError, match=r"RN50\.npz cannot be read"):
         clip_file.load(tmp_path / "RN50.npz")
-    file = write(tmp_path / "RN50.safetensors", state)
-    with pytest.raises(checkpoint.CheckpointError, match=r"RN50\.safetensors cannot be used: CLIP needs a tensor visual.*, got float32 \("):
+    file = write(tmp_path / "RN50.safetensors", state | {"ln_final.bias": np.zeros(7, np.float32)})
+    with pytest.raises(checkpoint.CheckpointError, match=r"safetensors cannot be used: CLIP needs .* ln_final\.bias .* got float32 \(7"):
         clip_file.load(file)
+    vit = write(tmp_path / "ViT.npz", {"visual.conv1.weight": np.ones((4, 3, 8, 8), np.float32)})
+    with pytest.raises(checkpoint.CheckpointError, match=r"ViT\.npz cannot be used: CLIP with a ResNet has .* visual\.layer1.* got none"):
+        clip_file.load(vit)
     file.write_bytes(file.read_bytes()[:-4])
     with pytest.raises(checkpoint.CheckpointError, match=r"RN50\.safetensors is damaged or no \.safetensors file: SafetensorError"):
-        clip_file.load(file, NET)
+        clip_file.load(file)
 
 
 @pytest.fixture(scope="module")
-def vocabulary():
-    """Ids as OpenAI orders them: bytes, bytes that end a word, merges, start and end."""
-    letters = list("!',abcdefghijklmnopqrstuvwxyz")
-    names = [*letters, *(f"{letter}</w>" for letter in letters), *(merge.replace(" ", "") for merge in MERGES), START, END]
-    return {name: index for index, name in enumerate(names)}
+def tokenizer(tmp_path_factory):
+    pytest.importorskip("tokenizers")
+    return clip_tokens.write(tmp_path_factory.mktemp("tokenizer") / "tokenizer.json")
 
 
-@pytest.fixture(scope="module")
-def tokenizer(vocabulary, tmp_path_factory):
-    """A small `tokenizer.json`, put together as Hugging Face's `CLIPConverter` does; with what must not be heeded."""
-    tokenizers = pytest.importorskip("tokenizers")
-    normalizers, pre, post = tokenizers.normalizers, tokenizers.pre_tokenizers, tokenizers.processors
-    merges = [tuple(merge.split()) for merge in MERGES]
-    made = tokenizers.Tokenizer(tokenizers.models.BPE(vocabulary, merges, end_of_word_suffix="</w>", unk_token=END))
-    made.normalizer = normalizers.Sequence([normalizers.NFC(), normalizers.Replace(tokenizers.Regex(r"\s+"), " "), normalizers.Lowercase()])
-    words = tokenizers.Regex(r"'s|'t|'re|'ve|'m|'ll|'d|[\p{L}]+|[\p{N}]|[^\s\p{L}\p{N}]+")
-    made.pre_tokenizer = pre.Sequence([pre.Split(words, "removed", invert=True), pre.ByteLevel(add_prefix_space=False)])
-    made.add_special_tokens([START, END])
-    made.post_processor = post.RobertaProcessing((END, vocabulary[END]), (START, vocabulary[START]), add_prefix_space=False)
-    made.enable_truncation(4)
-    made.enable_padding(length=9, pad_id=vocabulary[END])
-    file = tmp_path_factory.mktemp("tokenizer") / "tokenizer.json"
-    made.save(str(file))
-    return file
-
-
-def pieces(word):
-    """Merge as OpenAI's `SimpleTokenizer.bpe`: the pair that comes first among the merges, wherever it stands, until there is none."""
-    word = [*word[:-1], f"{word[-1]}</w>"]
-    while True:
-        ranks = [MERGES.index(pair) if (pair := " ".join(word[i : i + 2])) in MERGES else len(MERGES) for i in range(len(word) - 1)]
-        if min(ranks, default=len(MERGES)) == len(MERGES):
-            return word
-        first, second = MERGES[min(ranks)].split()
-        merged = []
-        for piece in word:
-            if piece == second and merged and merged[-1] == first:
-                merged[-1] = first + second
-            else:
-                merged.append(piece)
-        word = merged
-
-
-def test_tokens_are_openais(tokenizer, vocabulary):
+def test_tokens_are_openais(tokenizer):
     sentences = {"red": ["red"], "  A Red\n block's,  blue blocks!": ["a", "red", "block", "'s", ",", "blue", "blocks", "!"]}
     ids = clip_file.tokenize(tokenizer, list(sentences))
     assert ids.shape == (2, 77) and ids.dtype == np.int32
     for row, words in zip(ids, sentences.values(), strict=True):
-        expected = [START, *(piece for word in words for piece in pieces(word)), END]
-        assert row.tolist() == [vocabulary[piece] for piece in expected] + [0] * (77 - len(expected))
+        expected = clip_tokens.ids(words)
+        assert row.tolist() == expected + [0] * (77 - len(expected))
         assert row.argmax() == len(expected) - 1
-    assert len(pieces("blocks")) == 1 and len(pieces("blue")) > 1
+    assert len(clip_tokens.pieces("blocks")) == 1 and len(clip_tokens.pieces("blue")) > 1
+    assert clip_file.tokenize(tokenizer, ["red", "red red"], None).shape == (2, 4)
+
+
+@pytest.mark.parametrize("count", [1, 3, 6])
+def test_a_filled_template_is_the_tokenized_sentence(tokenizer, count):
+    """Colours of one to six pieces, each as if the sentence had been tokenized with it; the end is the highest id and last."""
+    names, rng = list(base.COLORS), np.random.default_rng(count)
+    assert {len(clip_tokens.pieces(name)) for name in names} >= {1, 3, 6}
+    made = clip_file.template(tokenizer, "tower", count, clip.Text(len(clip_tokens.vocabulary())))
+    colors = np.stack([rng.permutation(len(names))[:count] for _ in range(20)] + [np.full(count, names.index("yellow"))])
+    ids, mask = jax.jit(made.fill)(jnp.asarray(colors))
+    for row, shown, chosen in zip(ids, mask, colors, strict=True):
+        words = wording.sentence("tower", [names[index] for index in chosen]).replace(",", " ,").split()
+        expected = clip_tokens.ids(words)
+        assert row.tolist() == expected + [0] * (len(row) - len(expected))
+        assert shown.tolist() == [True] * len(expected) + [False] * (len(row) - len(expected))
+    assert mask.all(-1).any()  # no longer than it must be
+
+
+def test_a_tokenizer_of_other_weights(tokenizer):
+    with pytest.raises(checkpoint.CheckpointError, match=r"tokenizer\.json has 70 tokens, the weights are of 49408"):
+        clip_file.template(tokenizer, "tower", 2, clip.Text())
+    with pytest.raises(checkpoint.CheckpointError, match=r"makes 32 tokens of a sentence, the weights take 20"):
+        clip_file.template(tokenizer, "tower", 2, clip.Text(70, 20))
 
 
 def test_too_long_and_none_at_all(tokenizer):

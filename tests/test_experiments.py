@@ -2,6 +2,8 @@
 
 import json
 
+import clip_reference
+import clip_tokens
 import jax
 import numpy as np
 import pytest
@@ -302,12 +304,15 @@ ALWAYS = ("ours", "single", "graph", "blind", "top_view", "oracle")  # a row of 
 )
 def test_every_row_runs_end_to_end(name, tmp_path, uncached):
     """From demonstrations to the row, at a scale where scores mean nothing."""
-    rows = table1.plan("smoke")
+    row = next(row for row in table1.ROWS if row.name == name)
+    sizes = {"blocks": (1, 1, 1, 1), "width": 4, "side": 32, "embed": 6, "positions": 77, "text_width": 8, "layers": 1}
+    tensors = clip_reference.state(np.random.default_rng(0), vocab=len(clip_tokens.vocabulary()), **sizes)
+    files = clip_tokens.fields(tmp_path, tensors) if row.clip else ()
     config = shipped("tower")
     config.task.num_objects, config.data.directory = 2, str(tmp_path / "data")
     base = options.override(config, [*table1.shared(config, "smoke"), "eval.split=test"])
-    row = next(row for row in rows if row.name == name)
-    if not table1.can_run(row):
+    row = next(row for row in table1.plan("smoke", files) if row.name == name)
+    if not table1.can_run(row, files):
         pytest.skip(f"the extra {row.extra} is not installed")
     found = table1.run(row, base, tmp_path / "run", build.split_seeds("test", 0, 2))
     assert found["episodes"] == 2 and list(found["scores"]) == ["10001", "10002"]

@@ -11,7 +11,7 @@ import numpy as np
 import numpy_bert
 import pytest
 
-from lala_jax import checkpoint
+from lala_jax import checkpoint, wording
 from lala_jax.models import bert
 from lala_jax.sim.tasks import base
 
@@ -114,7 +114,7 @@ def test_tokens_are_the_words_of_the_vocabulary(language):
 def test_a_filled_template_is_the_tokenized_sentence(language, count):
     rng = np.random.default_rng(count)
     colors = np.stack([rng.permutation(len(COLORS))[:count] for _ in range(30)] + [np.full(count, COLORS.index("cyan"))])
-    sentences = [language.sentence("tower", [COLORS[index] for index in row]) for row in colors]
+    sentences = [wording.sentence("tower", [COLORS[index] for index in row]) for row in colors]
     for length, wrap in ((None, jax.jit), (26, lambda fill: jax.jit(jax.vmap(fill)))):
         found = wrap(language.template("tower", count, length).fill)(jnp.asarray(colors))
         for array, expected in zip(found, language.tokenize(sentences, length), strict=True):  # the last, all cyan, is the longest
@@ -122,17 +122,20 @@ def test_a_filled_template_is_the_tokenized_sentence(language, count):
             assert array.dtype == expected.dtype
 
 
-def test_the_sentence_is_the_papers(language):
+def test_the_sentence_is_the_papers():
     colors = ["yellow", "brown", "green", "blue", "red"]
-    assert language.sentence("tower", colors) == "make the tower with yellow, brown, green, blue, red blocks"
+    assert wording.sentence("tower", colors) == "make the tower with yellow, brown, green, blue, red blocks"
+
+
+def test_what_has_no_sentence_is_named():
+    for task in ("pallet", "shelf"):
+        with pytest.raises(ValueError, match=f"task '{task}' has no sentence: the paper gives one for 'tower' only"):
+            wording.sentence(task, ["red"])
+    with pytest.raises(ValueError, match="needs colours out of blue, red, .*, gray, got black, mauve$"):
+        wording.sentence("tower", ["red", "mauve", "black"])
 
 
 def test_mistakes_are_named(language):
-    for task in ("pallet", "shelf"):
-        with pytest.raises(ValueError, match=f"task '{task}' has no sentence: the paper gives one for 'tower' only"):
-            language.sentence(task, ["red"])
-    with pytest.raises(ValueError, match="needs colours out of blue, red, .*, gray, got black, mauve$"):
-        language.sentence("tower", ["red", "mauve", "black"])
     with pytest.raises(ValueError, match="needs colours out of .*, got none$"):
         language.template("tower", 0)
     with pytest.raises(ValueError, match="'one two three' has 5 tokens, more than the 4 that are asked for"):

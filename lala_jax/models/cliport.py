@@ -1,9 +1,9 @@
-"""CLIPort's two-stream Transporter, told by a sentence what to do: its "RN50 + BERT" form with lateral connections.
+"""CLIPort's two-stream Transporter, told by a sentence what to do: its forms with lateral connections, "RN50 + BERT" and CLIP's own.
 
 A spatial stream sees the map. A semantic stream sees what frozen encoders made of the map's colours and of the sentence;
-they stay outside, their outputs are inputs here. From CLIPort: `ResNet45_10s`, `RN50BertLingUNetLat`, `Up`, `FusionConvLat`,
-`TwoStreamAttentionLangFusionLat` and `TwoStreamTransportLangFusionLat`, fused by "mult", "add" and "conv" as its `train.yaml`
-says. The semantic stream is as deep as the features reach: ImageNet's ResNet-50 to 1/32 is CLIPort's, shorter ones do.
+they stay outside, their outputs are inputs here. From CLIPort: `ResNet45_10s`, `RN50BertLingUNetLat` and `CLIPLingUNetLat`, `Up`,
+`FusionConvLat`, `TwoStreamAttentionLangFusionLat` and `TwoStreamTransportLangFusionLat`, fused by "mult", "add" and "conv" as its
+`train.yaml` says. The semantic stream is as deep as the features reach: a ResNet-50 to 1/32 is CLIPort's, shorter ones do.
 """
 
 from __future__ import annotations
@@ -53,6 +53,8 @@ class SpatialStream(nn.Module):
 class SemanticStream(nn.Module):
     """Predict `out` values a cell from frozen features, a sentence and the spatial stream: CLIPort's `RN50BertLingUNetLat`.
 
+    Without a `text_layer`, a dense layer that the sentence passes before all else, it is `CLIPLingUNetLat`.
+
     From the coarsest features up: multiply by the sentence, double, join the next finer features, convolve twice, join the
     spatial stream's; past the finest features, a residual pair, double and join the spatial stream's. There are `width * s / 2`
     channels at stride `s`, down to twice the map's size; the way back takes every other cell.
@@ -65,6 +67,7 @@ class SemanticStream(nn.Module):
     out: int
     width: int = 64
     dtype: jnp.dtype = jnp.float32
+    text_layer: bool = True
 
     @nn.compact
     def __call__(self, features: Sequence[jax.Array], laterals: Sequence[jax.Array], sentence: jax.Array) -> jax.Array:
@@ -72,7 +75,7 @@ class SemanticStream(nn.Module):
         *skips, x = features
         level = int(math.log2(laterals[-1].shape[-2] // x.shape[-2]))  # doublings to go
         x = nn.relu(self._conv(self._width(level), 3, "stem")(x))
-        text = nn.Dense(16 * self.width, dtype=self.dtype, name="text")(sentence)
+        text = nn.Dense(16 * self.width, dtype=self.dtype, name="text")(sentence) if self.text_layer else sentence
         for skip in reversed(skips):
             x = x * nn.Dense(x.shape[-1], dtype=self.dtype, name=f"language{level}")(text)
             level -= 1
@@ -114,6 +117,7 @@ class TwoStream(nn.Module):
     width: int = 64
     stages: int = 5
     dtype: jnp.dtype = jnp.float32
+    text_layer: bool = True
 
     def __post_init__(self):
         if self.fusion not in streams.FUSIONS:
@@ -124,7 +128,7 @@ class TwoStream(nn.Module):
     def __call__(self, maps: jax.Array, features: Sequence[jax.Array], sentence: jax.Array) -> jax.Array:
         """Map a map `[..., H, W, C]`, features of it `[..., H / s, W / s, c]` and a sentence `[e]` to float32 `[..., H, W, out]`."""
         spatial, laterals = SpatialStream(self.out, self.width, self.stages, self.dtype, name="spatial")(maps)
-        semantic = SemanticStream(self.out, self.width, self.dtype, name="semantic")(features, laterals, sentence)
+        semantic = SemanticStream(self.out, self.width, self.dtype, self.text_layer, name="semantic")(features, laterals, sentence)
         if self.fusion == "add":
             return spatial.astype(jnp.float32) + semantic.astype(jnp.float32)
         both = nn.relu(jnp.concatenate([spatial, semantic], -1))
@@ -138,7 +142,9 @@ class Cliport(nn.Module):
     its colours, `[rows / s, cols / s, c_s]`, fine to coarse, each stride twice the one before: two or more. Feature `[i, j]`
     lies over cell `[s * i, s * j]`, as padded strided convolutions put it. `sentence` `[e]` is a frozen encoder's, with entries of
     about one: what it says is multiplied in, so an embedding of length one (MiniLM's) times `sqrt(e)`, or it is hardly heard.
-    CLIPort's own are ResNet-50's at strides 4, 8, 16 and 32 with 256 to 2048 channels, and DistilBERT's mean of 768.
+    CLIPort's own are ResNet-50's at strides 4, 8, 16 and 32 with 256 to 2048 channels, and DistilBERT's mean of 768, or CLIP's
+    features of the same sizes and its 1024, without a `text_layer`. CLIP's features lie up to `s / 2 - 1` cells further on
+    (`clip.Visual`), in CLIPort too: the layers after them are left to learn that.
 
     CLIPort pads a map's picture before the backbone sees it, here its features are padded. Raises ValueError for an unknown
     `method`, for fewer than one rotation, for a crop that the strides do not divide, for features that are not as above, and
@@ -152,6 +158,7 @@ class Cliport(nn.Module):
     stages: int = 5  # of the spatial stream
     method: str = "auto"  # one of correlation.METHODS
     dtype: jnp.dtype = jnp.float32  # what the networks compute in
+    text_layer: bool = True  # between the sentence and what it multiplies; CLIPort has none where the sentence is CLIP's
 
     def __post_init__(self):
         if self.method not in correlation.METHODS:
@@ -161,7 +168,7 @@ class Cliport(nn.Module):
         super().__post_init__()
 
     def setup(self):
-        shared = self.width, self.stages, self.dtype
+        shared = self.width, self.stages, self.dtype, self.text_layer
         self.pick_net = TwoStream(1, "add", *shared)
         self.key_net = TwoStream(self.channels, "conv", *shared)
         self.query_net = TwoStream(self.channels, "conv", *shared)

@@ -93,6 +93,32 @@ def test_rn50_has_the_published_parameters():
     assert image.shape == (2, 1024) and [x.shape for x in text] == [(3, 1024), (3, 77, 512)]
 
 
+@pytest.mark.parametrize(
+    "sizes, net",
+    [
+        (RN50, clip.Clip()),
+        (
+            RN50 | {"blocks": (4, 6, 10, 6), "width": 80, "side": 288, "embed": 640, "text_width": 640},
+            clip.Clip(clip.Visual((4, 6, 10, 6), 80), clip.Pool(9, 40, 640), clip.Text(width=640, heads=10, out=640)),
+        ),
+    ],
+    ids=["RN50", "RN50x4"],
+)
+def test_sizes_are_read_off_the_shapes(sizes, net):
+    """Those that OpenAI published; with numbers of heads that its constructors compute."""
+    arrays = {name: np.broadcast_to(np.float32(0), shape) for name, shape in clip_reference.shapes(**sizes).items()}
+    assert clip.sized(arrays) == net
+    assert net.visual.stride == 32 and clip.Visual((1, 1)).stride == 8
+
+
+@pytest.mark.parametrize("name", ["visual.layer1.0.conv1.weight", "token_embedding.weight", "text_projection"])
+def test_what_says_no_sizes(name):
+    for arrays, got in (({}, "none"), ({name: np.ones(3)}, r"one of shape \(3,\)")):
+        left = {other: tensor for other, tensor in state().items() if other != name} | arrays
+        with pytest.raises(ValueError, match=rf"CLIP with a ResNet has a tensor {name} of \d dimensions, got {got}"):
+            clip.sized(left)
+
+
 def test_features_lie_off_their_patches_corner():
     """With kernels that are even along the rows, mirroring 95 rows mirrors the features: rows `s * i + s / 2 - 1` lie evenly there."""
     even = jax.tree.map(lambda x: (x + x[::-1]) / 2 if x.ndim == 4 else x, variables())

@@ -42,15 +42,16 @@ def _spatial(channels, out):
     return 9 * channels * 64 + 64 + pairs + _pair(32, 16, out)
 
 
-def _semantic(channels, embed, out):
-    """Add up `RN50BertLingUNetLat` without its frozen encoders, and apart the biases that its batch norm cancels.
+def _semantic(channels, embed, out, text_fc):
+    """Add up `RN50BertLingUNetLat`, or `CLIPLingUNetLat`, without frozen encoders, and apart the biases that its batch norm cancels.
 
-    `channels` are the features'; CLIPort's are 256, 512, 1024, 2048. With fewer, its first levels are left out.
+    `channels` are the features'; CLIPort's are 256, 512, 1024, 2048. With fewer, its first levels are left out. `CLIPLingUNetLat`
+    has no `text_fc`: its `lang_proj` take CLIP's 1024.
     """
     *skips, last = channels
-    total, cancelled = embed * 1024 + 1024 + 9 * last * (last // 2), 0  # text_fc and conv1
+    total, cancelled = (embed * 1024 + 1024 if text_fc else 0) + 9 * last * (last // 2), 0  # and conv1
     for skip in skips:
-        total += 1024 * skip + skip  # lang_proj
+        total += (1024 if text_fc else embed) * skip + skip  # lang_proj
         for before, after in ((2 * skip, skip), (skip, skip // 2)):  # Up's DoubleConv
             total += 9 * before * after + after + 2 * after
             cancelled += after
@@ -61,19 +62,27 @@ def _semantic(channels, embed, out):
 
 
 @pytest.mark.parametrize(
-    "channels, embed, public",
-    [((256, 512, 1024, 2048), 768, 279_377_803), ((256, 512), 384, 128_947_339)],
-    ids=["RN50 + BERT", "conv3 + MiniLM"],
+    "channels, embed, text_layer, public",
+    [
+        ((256, 512, 1024, 2048), 768, True, 279_377_803),
+        ((256, 512, 1024, 2048), 1024, False, 277_015_435),
+        ((256, 512), 384, True, 128_947_339),
+    ],
+    ids=["RN50 + BERT", "CLIP", "conv3 + MiniLM"],
 )
-def test_has_the_public_parameters(channels, embed, public):
-    """CLIPort's TwoStreamRN50BertLingUNetLatTransporterAgent: attention and twice two streams, and the 1x1s that fuse the latter."""
-    counts = [_semantic(channels, embed, out) for out in (1, 3, 3)]
+def test_has_the_public_parameters(channels, embed, text_layer, public):
+    """CLIPort's TwoStreamRN50BertLingUNetLatTransporterAgent and TwoStreamClipLingUNetLatTransporterAgent.
+
+    They are attention and twice two streams, and the 1x1s that fuse the latter.
+    """
+    counts = [_semantic(channels, embed, out, text_layer) for out in (1, 3, 3)]
     total = sum(count for count, _ in counts) + sum(_spatial(6, out) for out in (1, 3, 3)) + 2 * 6 * 3
     assert total == public
     maps = jax.ShapeDtypeStruct((320, 160, 6), jnp.float32)
     features = [jax.ShapeDtypeStruct((320 // (4 << i), 160 // (4 << i), c), jnp.float32) for i, c in enumerate(channels)]
     sentence, cell = jax.ShapeDtypeStruct((embed,), jnp.float32), jax.ShapeDtypeStruct((2,), jnp.int32)
-    (logits, intermediates), params = jax.eval_shape(cliport.Cliport().init_with_output, jax.random.key(0), maps, features, sentence, cell)
+    net = cliport.Cliport(text_layer=text_layer)
+    (logits, intermediates), params = jax.eval_shape(net.init_with_output, jax.random.key(0), maps, features, sentence, cell)
     assert sum(leaf.size for leaf in jax.tree.leaves(params)) == public - sum(cancelled for _, cancelled in counts)
     assert logits["pick"].shape == (320, 160) and logits["place"].shape == (36, 320, 160)
     assert intermediates["key"].shape == (384, 224, 3) and intermediates["query"].shape == (36, 64, 64, 3)
@@ -102,7 +111,7 @@ def _semantic_values(params, features, laterals, sentence):
         return (x - mean) / np.sqrt(variance + 1e-5) * leaf["scale"] + leaf["bias"]
 
     *skips, x = features
-    text = dense(sentence, params["text"])
+    text = dense(sentence, params["text"]) if "text" in params else sentence  # CLIPLingUNetLat has no such layer
     x = reference.relu(reference.conv(x, params["stem"]))
     for level in reversed(range(int(np.log2(laterals[-1].shape[-2] / x.shape[-2])))):
         if skips:
@@ -118,9 +127,9 @@ def _semantic_values(params, features, laterals, sentence):
     return reference.conv(x, params["head"])[..., ::2, ::2, :]
 
 
-def _two_streams(params, maps, features, sentence):
+def _two_streams(params, maps, features, sentence, stages=SMALL["stages"]):
     maps, *features = (np.asarray(one, np.float64) for one in (maps, *features))
-    spatial, laterals = _spatial_values(params["spatial"], maps, SMALL["stages"])
+    spatial, laterals = _spatial_values(params["spatial"], maps, stages)
     semantic = _semantic_values(params["semantic"], features, laterals, sentence)
     if "fuse" not in params:
         return spatial + semantic
@@ -165,6 +174,18 @@ def test_equals_its_formulas_in_numpy():
         np.testing.assert_allclose(place, expected, atol=1e-3 * expected.std())
     other, *_ = both(params, maps, features, sentence[::-1], seen)
     assert np.abs(other["pick"] - logits["pick"]).max() > 1e-2 * pick.std()
+
+
+def test_clips_form_equals_its_formulas_in_numpy():
+    """Two streams to a stride of 32, whose sentence is multiplied in without a layer of its own before."""
+    net = cliport.TwoStream(2, "conv", width=4, stages=5, text_layer=False)
+    maps, features, sentence = _inputs(64, 32, (4, 8, 16, 32))
+    params = _drawn(jax.eval_shape(net.init, jax.random.key(0), maps, features, sentence))
+    expected = _two_streams(params["params"], maps, features, sentence, stages=5)
+    found = jax.jit(net.apply)(params, maps, features, sentence)
+    np.testing.assert_allclose(found, expected, atol=1e-3 * expected.std())
+    other = jax.jit(net.apply)(params, maps, features, sentence[::-1])
+    assert np.abs(other - found).max() > 1e-2 * expected.std()
 
 
 @pytest.mark.parametrize("stride", [1, 2, 4])
