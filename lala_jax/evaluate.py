@@ -11,7 +11,7 @@ import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from lala_jax import build, options, pretrained, scoring, writers
+from lala_jax import build, compiling, options, pretrained, scoring, writers
 
 FLAGS = {"checkpoint": "", "agent": "policy", "split": "", "start": -1, "episodes": 0}
 NO_CHECKPOINT = "give --checkpoint=PATH, or --config=FILE.py with --agent=oracle, blind or top_view"
@@ -66,6 +66,7 @@ def stored_config(flags: Mapping[str, Any]):
 
 
 if __name__ == "__main__":
+    compiling.keep()
     options.run(
         main,
         flags=FLAGS,
