@@ -43,7 +43,11 @@ def main(config, workdir, *, task: str, stages: str, growth: bool, repeats: int,
     known = [name for name in every if name not in ceilings]
     wanted = [options.check_choice("--stages", name, known) for name in stages.split(",") if name] or known
     before = read(against) if against else None
-    rows = [timing.timed(name, every, config, repeats) for name in (*ceilings, *wanted)]
+    rows = []
+    for name in (*ceilings, *wanted):
+        print(f"{name}: {every[name].label}", flush=True)
+        rows.append(timing.timed(name, every, config, repeats))
+        print(f"  {cost(rows[-1])}", flush=True)
     peaks = {field: next(row for row in rows if row["name"] == name)[f"{field}_per_second"] for name, field in ceilings.items()}
     for row in rows:
         row["share"] = {field: row[f"{field}_per_second"] / peak for field, peak in peaks.items() if f"{field}_per_second" in row}
@@ -76,20 +80,24 @@ def machine() -> dict[str, Any]:
 # Tables and comparisons
 
 
+def cost(row: Mapping[str, Any]) -> str:
+    """Write a row's median, or why there is none."""
+    one = "an" if row["unit"][0] in "aeiou" else "a"
+    return row.get("unavailable") or f"{benchmark_targets.seconds_text(row['seconds'])} {one} {row['unit']}"
+
+
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Write the stages as a Markdown table; memory is what XLA reckons for one run, or what a process of its own took for it."""
     lines = []
     for row in rows:
         if "unavailable" in row:
-            lines.append([row["label"], row["unavailable"], *[""] * 5])
+            lines.append([row["label"], cost(row), *[""] * 5])
             continue
         share = [f"{100 * row['share'][field]:.0f}%" if field in row["share"] else "" for field in benchmark_stages.CEILINGS.values()]
         spread = f"{benchmark_targets.seconds_text(row['lowest'])} to {benchmark_targets.seconds_text(row['highest'])}"
         need = row.get("process_memory", row.get("memory"))
         size = "" if need is None else f"{need / 2**20:,.0f} MiB"
-        lines.append(
-            [row["label"], f"{benchmark_targets.seconds_text(row['seconds'])} a {row['unit']}", spread, f"{row['runs']}", *share, size]
-        )
+        lines.append([row["label"], cost(row), spread, f"{row['runs']}", *share, size])
     return common.table(["stage", "median", "range", "runs", "of the matrix rate", "of the copy rate", "memory"], lines)
 
 

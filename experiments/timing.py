@@ -103,7 +103,6 @@ def compilations() -> list[str]:
 def timed(name: str, stages: Mapping[str, Stage], config, repeats: int) -> dict[str, Any]:
     """Time a stage: a row with the median and the extremes of a thing in seconds; or why it could not run."""
     stage = stages[name]
-    print(f"{name}: {stage.label}", flush=True)
     row = {"name": name, "label": stage.label, "unit": stage.unit}
     try:
         if stage.alone:
