@@ -13,7 +13,7 @@ import shutil
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from lala_jax import build, cluster, options, pretrained, scoring, writers
+from lala_jax import build, cluster, compiling, options, pretrained, scoring, writers
 
 FLAGS = {"checkpoint": "", "agent": "policy", "split": "", "start": -1, "episodes": 0, **cluster.FLAGS}
 NO_CHECKPOINT = "give --checkpoint=PATH, or --config=FILE.py with --agent=oracle, blind or top_view"
@@ -74,6 +74,7 @@ def stored_config(flags: Mapping[str, Any]):
 
 
 if __name__ == "__main__":
+    compiling.keep()
     options.run(
         main,
         flags=FLAGS,

@@ -10,9 +10,10 @@ import jax
 import numpy as np
 from rich import progress
 
-from lala_jax import checkpoint, options, state, writers
+from lala_jax import checkpoint, compiling, options, state, writers
 
 Metrics = Mapping[str, jax.Array]
+Step = Callable[[state.TrainState], tuple[state.TrainState, Metrics]]
 
 
 class NonFiniteError(RuntimeError):
@@ -62,8 +63,24 @@ def start_or_resume(
     return found[1]
 
 
+def compiled(jitted, recipe: Any, current: state.TrainState, *inputs: Any) -> Step:
+    """Compile `jitted(recipe, state, *inputs)`, whose recipe is static, say what a step needs, and give it as a function of the state."""
+    print("compiling the training step", flush=True)
+    program, facts = compiling.build(jitted, recipe, current, *inputs)
+    memory = f"{facts['memory'] / 2**20:,.0f} MiB" if "memory" in facts else "an unknown amount"
+    print(f"compiled in {facts['compile_seconds']:.0f} s; a step needs {memory} of memory", flush=True)
+    return lambda current: program(current, *inputs)
+
+
+def estimate(steps: int, seconds: float) -> str:
+    """Say how long the `steps` left will take, by one that took `seconds`."""
+    whole = steps * seconds
+    scale, unit = next((one for one in ((3600, "hours"), (60, "minutes")) if whole >= 1.5 * one[0]), (1, "seconds"))
+    return f"{steps} more steps of {seconds:.2g} s take about {whole / scale:.3g} {unit}; validation and saving come on top"
+
+
 def run(
-    step: Callable[[state.TrainState], tuple[state.TrainState, Metrics]],
+    prepare: Callable[[state.TrainState], Step],
     current: state.TrainState,
     *,
     total: int,
@@ -77,17 +94,25 @@ def run(
 ) -> state.TrainState:
     """Take steps up to `total`, log means and save now and then; leave early, saved, once `stopped()`.
 
-    `note` puts the means into a few words. `save` and `after` get a step's number and state; `after`, called past every step that
-    did not leave, says whether it did anything, the time of which is then not the steps'.
+    `prepare` gives the step for states like `current`; it is called once, if there are steps to take, and its time is theirs. `note`
+    puts the means into a few words. `save` and `after` get a step's number and state; `after`, called past every step that did not
+    leave, says whether it did anything, the time of which is then not the steps'.
     """
     seen, begin = [], time.time()
     columns = (*progress.Progress.get_default_columns(), progress.MofNCompleteColumn(), progress.TextColumn("{task.fields[note]}"))
     with progress.Progress(*columns, speed_estimate_period=600) as bar:
         plain = not bar.console.is_terminal  # a log file gets a line now and then instead of a bar
-        shown = bar.add_task("training", total=total, completed=int(current.step), note="compiling")
-        for number in range(int(current.step) + 1, total + 1):
+        first = int(current.step) + 1
+        shown = bar.add_task("training", total=total, completed=first - 1, note="compiling")
+        step = prepare(current) if first <= total else None
+        for number in range(first, total + 1):
+            start = time.time()
             current, metrics = step(current)
             seen.append(metrics)
+            if number <= first + 1:  # the second one says how long they take: the first may have had something to set up
+                jax.block_until_ready((current, metrics))
+            if number == first + 1 < total:
+                print(estimate(total - number, time.time() - start), flush=True)
             if number % log_every == 0 or number == total:
                 values = mean_metrics(seen, last=number)
                 values["seconds_per_step"], seen, begin = (time.time() - begin) / len(seen), [], time.time()

@@ -82,8 +82,9 @@ def pretrain(config, workdir: str) -> pathlib.Path:
     stored = {"config": options.to_dict(config), "input_spec": {"encoder": recipe.model.stage}}
     with writers.Writer(out) as writer, checkpoint.stop_signals((signal.SIGTERM, signal.SIGINT)) as stopped:
         run = loop.run(
-            lambda run: step(recipe, run, states, frozen, key), run, total=config.pretrain.steps, log_every=config.train.log_every,
-            save_every=config.train.save_every, save=lambda number, run: store.save_latest(number, run, **stored), writer=writer,
+            lambda run: loop.compiled(step, recipe, run, states, frozen, key), run, total=config.pretrain.steps,
+            log_every=config.train.log_every, save_every=config.train.save_every,
+            save=lambda number, run: store.save_latest(number, run, **stored), writer=writer,
             note=lambda mean: f"loss {mean['loss']:.3f}, {mean['explained']:.1%} explained", stopped=stopped,
         )  # fmt: skip
     if int(run.step) < config.pretrain.steps:
@@ -98,4 +99,5 @@ def main(config, workdir) -> None:
 
 
 if __name__ == "__main__":
+    compiling.keep()
     options.run(main, workdir=WORKDIR, user_errors=(*build.USER_ERRORS, loop.NonFiniteError))

@@ -66,8 +66,9 @@ def _loop(config, recipe, run, states, store, stored, writer, stopped) -> state.
         return due
 
     return loop.run(
-        lambda run: step(recipe, run, states, key, recipe.policy.frozen), run, total=config.train.steps, log_every=config.train.log_every,
-        save_every=config.train.save_every, save=lambda number, run: store.save_latest(number, run, **stored), writer=writer,
+        lambda run: loop.compiled(step, recipe, run, states, key, recipe.policy.frozen), run, total=config.train.steps,
+        log_every=config.train.log_every, save_every=config.train.save_every,
+        save=lambda number, run: store.save_latest(number, run, **stored), writer=writer,
         note=lambda mean: f"loss {mean['loss']:.2f}, pick {mean['pick_right']:.2f}, place {mean['place_right']:.2f}",
         stopped=stopped, after=validate,
     )  # fmt: skip
@@ -112,4 +113,5 @@ def main(config, workdir) -> None:
 
 
 if __name__ == "__main__":
+    compiling.keep()
     options.run(main, workdir=build.WORKDIR, user_errors=(*build.USER_ERRORS, loop.NonFiniteError))

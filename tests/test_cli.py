@@ -3,7 +3,9 @@
 Training runs as a process of its own; what follows runs each module's `__main__` here, which saves the start of a process.
 """
 
+import collections
 import json
+import os
 import pathlib
 import re
 import shutil
@@ -32,9 +34,11 @@ def trained(tmp_path_factory):
     """A finished training: `(data directory, work directory, what it said)`."""
     path = tmp_path_factory.mktemp("cli")
     command = [sys.executable, "-m", "lala_jax.train", f"--workdir={path / 'run'}", *tiny(path / "data")]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    environment = {**os.environ, "JAX_LOG_COMPILES": "1"}
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, env=environment)
     assert done.returncode == 0, done.stderr
     assert "Traceback" not in done.stderr
+    (path / "compilations").write_text(done.stderr)
     return path / "data", path / "run", done.stdout
 
 
@@ -54,7 +58,18 @@ def test_training_leaves_everything_behind(trained):
     scores = json.loads((workdir / "scores-policy-val.json").read_text())
     assert scores["episodes"] == 1 and scores["seeds"] == [1, 1] and 0 <= scores["score"] <= 100
     assert (workdir / "episode-val-0.webp").stat().st_size > 1000
-    assert "4 states, step 0" in said and "step 2 of 2" in said and "tower policy, val split, 1 episodes: score" in said
+    assert re.search(r"4 states, step 0\ncompiling the training step\ncompiled in \d+ s; a step needs \d+ MiB of memory\n", said)
+    assert "step 2 of 2" in said and "tower policy, val split, 1 episodes: score" in said
+
+
+def test_every_program_was_compiled_once(trained):
+    """Training, validation and scoring: no program of ours is compiled twice for the same shapes, and the step only once."""
+    log = (trained[1].parent / "compilations").read_text()
+    programs = collections.Counter(
+        re.findall(r"Compiling jit\((train_step|act_batch|observe_batch)\) with global shapes and types (.*)", log)
+    )
+    assert {name for name, _ in programs} == {"train_step", "act_batch", "observe_batch"}
+    assert set(programs.values()) == {1} and sum(name == "train_step" for name, _ in programs) == 1
 
 
 def test_the_same_command_again_finds_it_complete(trained, call):

@@ -1,9 +1,13 @@
 """The loop of a run, on a step that counts: what is logged, saved and seen, and that a stop loses nothing."""
 
+import itertools
 import json
 import os
+import re
 import signal
+import types
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
@@ -23,9 +27,12 @@ def fresh():
     return state.create({"w": jnp.float32(8.0)}, optax.sgd(0.5))
 
 
-def go(directory, total, *, signal_at=None, nan_at=None, after=lambda *_: False):
-    """Run `w -= w / 2`, each step's loss the step's number; gives the state and the numbers of the steps saved."""
-    store, saved = checkpoint.Checkpoints(directory), []
+def go(directory, total, *, signal_at=None, nan_at=None, after=lambda *_: False, prepared=None):
+    """Run `w -= w / 2`, each step's loss the step's number; gives the state and the numbers of the steps saved.
+
+    The number of the step it begins after is added to the list `prepared` when the step is asked for.
+    """
+    store, saved, prepared = checkpoint.Checkpoints(directory), [], [] if prepared is None else prepared
 
     def step(run):
         number = int(run.step) + 1
@@ -37,9 +44,15 @@ def go(directory, total, *, signal_at=None, nan_at=None, after=lambda *_: False)
         saved.append(number)
         store.save_latest(number, run, **STORED)
 
+    def prepare(run):
+        prepared.append(int(run.step))
+        return step
+
     run = loop.start_or_resume(fresh(), store, CONFIG, settings)
     with writers.Writer(directory, tensorboard=False) as writer, checkpoint.stop_signals() as stopped:
-        run = loop.run(step, run, total=total, log_every=2, save_every=3, save=save, note=str, writer=writer, stopped=stopped, after=after)
+        run = loop.run(
+            prepare, run, total=total, log_every=2, save_every=3, save=save, note=str, writer=writer, stopped=stopped, after=after
+        )
     return run, saved
 
 
@@ -59,6 +72,36 @@ def test_a_signal_saves_and_the_same_call_goes_on(tmp_path):
     run, saved = go(tmp_path, 5)
     assert int(run.step) == 5 and saved == [3, 5] and float(run.params["w"]) == 8 / 32
     assert go(tmp_path, 5)[1] == []
+
+
+def test_a_step_is_prepared_once_and_only_where_one_is_taken(tmp_path):
+    prepared = []
+    for total in (2, 5, 5):
+        go(tmp_path, total, prepared=prepared)
+    assert prepared == [0, 2]
+
+
+def test_what_is_left_is_told_after_two_steps(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(loop, "time", types.SimpleNamespace(time=itertools.count(0, 30).__next__))
+    go(tmp_path / "long", 8)
+    assert re.findall(r"\d+ more steps of .*?(?=;)", capsys.readouterr().out) == ["6 more steps of 30 s take about 3 minutes"]
+    go(tmp_path / "short", 2)
+    assert "more steps" not in capsys.readouterr().out
+    assert loop.estimate(1000, 0.05).startswith("1000 more steps of 0.05 s take about 50 seconds;")
+    assert "about 5.56 hours" in loop.estimate(20_000, 1.0)
+
+
+def test_a_compiled_step_is_one_program_that_says_what_it_needs(capsys):
+    traced = []
+
+    def step(rate, run, scale):
+        traced.append(rate)
+        return run.replace(step=run.step + 1, params=jax.tree.map(lambda w: w - rate * scale * w, run.params)), {}
+
+    take = loop.compiled(jax.jit(step, static_argnums=0), 0.5, fresh(), jnp.float32(1.0))
+    run, _ = take(take(fresh())[0])
+    assert traced == [0.5] and int(run.step) == 2 and float(run.params["w"]) == 2.0
+    assert re.search(r"compiled in \d+ s; a step needs \d+ MiB of memory", capsys.readouterr().out)
 
 
 def test_what_is_not_finite_is_named_and_not_saved(tmp_path):

@@ -1,0 +1,435 @@
+"""The stages that `benchmark` times; as a program it times the one that `timing.alone` asks for."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import optax
+
+from experiments import timing
+from lala_jax import build, checkpoint, compiling, losses, options, policy, recording, rollout, scoring, state, train_step, types
+from lala_jax.models import correlation, transporter
+from lala_jax.perception import topdown
+from lala_jax.sim import oracle, physics, render, robot, scene
+
+BATCH = 8  # observations at a time, where a stage takes several
+FULL = {"camera.height": 480, "camera.width": 640}  # the cameras' own resolution
+EGL = {"MUJOCO_GL": "egl"} if sys.platform == "linux" else {}  # renders without a display
+
+
+def matrix_product(config) -> timing.Work:
+    """Multiply two matrices of 2048 x 2048."""
+    del config
+    x = jax.random.normal(jax.random.key(0), (2048, 2048))
+    return timing.compiled(jnp.matmul, x, x)
+
+
+def copy(config) -> timing.Work:
+    """Read and write 256 MB."""
+    del config
+    return timing.compiled(lambda x: x + 1.0, jnp.zeros(64 << 20))
+
+
+def scenes_of(config, count: int) -> tuple[types.Scene, jax.Array]:
+    """Draw scenes of val seeds, stacked, each with half of its objects at their goals: `(scenes, poses [B, N, 7])`."""
+    task = build.task(config)
+    drawn = [task.sample(seed) for seed in build.split_seeds("val", 0, count)]
+    stacked = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves), jnp.float32), *drawn)
+    half = jnp.arange(stacked.start.shape[1])[:, None] < stacked.start.shape[1] // 2
+    return stacked, jnp.where(half, stacked.goal, stacked.start)
+
+
+def resized(config, **fields):
+    """Give the config with other fields."""
+    return options.override(config, [f"{name}={value}" for name, value in fields.items()])
+
+
+def full_size(config):
+    """Give the config with the cameras' own resolution."""
+    return resized(config, **FULL)
+
+
+def render_views(config) -> timing.Work:
+    """Render the views of some scenes with the arm parked."""
+    observer, (drawn, poses) = build.observer(config), scenes_of(config, BATCH)
+    observer.background()
+    return timing.compiled(jax.vmap(observer.views), drawn.size, drawn.color, drawn.base, poses, count=BATCH)
+
+
+def render_mujoco(config) -> timing.Work:
+    """Render colour and depth of the same views with MuJoCo, the arm parked."""
+    task, cameras = build.task(config), build.observer(config).camera
+    model = scene.build_model(task, task.sample(1), cameras=cameras)
+    data = mujoco.MjData(model)
+    robot.Arm(model).reset(data)
+    mujoco.mj_forward(model, data)
+    try:
+        renderer = mujoco.Renderer(model, cameras.height, cameras.width)
+    except Exception as error:  # each GL backend has its own
+        raise timing.Unavailable(f"mujoco.Renderer needs OpenGL: {type(error).__name__} {error}") from error
+    names = [model.camera(i).name for i in range(model.ncam)]
+
+    def run():
+        return [look(renderer, data, name) for name in names]
+
+    return timing.Work(run, close=renderer.close)
+
+
+def look(renderer: mujoco.Renderer, data: mujoco.MjData, camera: str) -> tuple[np.ndarray, np.ndarray]:
+    """Give a camera's picture `[H, W, 3]` uint8 and depth `[H, W]` in metres."""
+    pictures = []
+    for switch in (renderer.disable_depth_rendering, renderer.enable_depth_rendering):
+        switch()
+        renderer.update_scene(data, camera=camera)
+        pictures.append(renderer.render())
+    return pictures[0], pictures[1]
+
+
+def fuse(config) -> timing.Work:
+    """Unproject and fuse rendered views."""
+    observer, (drawn, poses) = build.observer(config), scenes_of(config, BATCH)
+    views = jax.jit(jax.vmap(observer.views))(drawn.size, drawn.color, drawn.base, poses)
+    return timing.compiled(observer.fuse, views, count=BATCH)
+
+
+def observe(config) -> timing.Work:
+    """Render, unproject and fuse."""
+    observer, (drawn, poses) = build.observer(config), scenes_of(config, BATCH)
+    observer.background()
+
+    def maps(size, color, base, poses):
+        return topdown.from_views_batch(jax.vmap(observer.views)(size, color, base, poses), spec=observer.spec)
+
+    return timing.compiled(maps, drawn.size, drawn.color, drawn.base, poses, count=BATCH)
+
+
+def features(config) -> timing.Work:
+    """Run the pretrained backbone on the views and fuse its features."""
+    observer, (drawn, poses) = build.observer(resized(config, **{"camera.backbone": "resnet50_imagenet_v1"})), scenes_of(config, 1)
+    views = jax.jit(jax.vmap(observer.views))(drawn.size, drawn.color, drawn.base, poses)
+    return timing.compiled(observer.fuse, views)
+
+
+def act(config) -> timing.Work:
+    """Let the policy act on one pair of maps."""
+    agent = build.build_policy(config)
+    params = jax.jit(agent.init)(jax.random.key(0, impl="rbg"))
+    blank = policy.empty_map(agent.spec)
+    return timing.compiled(agent.act, params, blank, blank)
+
+
+def correlate(config, *, method: str, rotations: int = 36, rows: int = 320, cols: int = 160) -> timing.Work:
+    """Correlate forward and backward at the paper's size: 64 x 64 crops, 3 channels."""
+    del config
+    keys = jax.random.split(jax.random.key(0))
+    inputs = jax.random.normal(keys[0], (rows, cols, 3)), jax.random.normal(keys[1], (rotations, 64, 64, 3))
+
+    def loss(key, kernels):
+        return jnp.square(correlation.correlate(key, kernels, method=method)).mean()
+
+    return timing.compiled(jax.value_and_grad(loss, (0, 1)), *inputs)
+
+
+def states_of(config, count: int) -> types.State:
+    """Make training states without physics: scenes half done."""
+    drawn, poses = scenes_of(config, count)
+    task = build.task(config)
+    done = [(oracle.placed(task, *one), oracle.ready(task, *one)) for one in zip(unstacked(drawn), np.asarray(poses), strict=True)]
+    placed, ready = (jnp.asarray(np.stack(leaves)) for leaves in zip(*done, strict=True))
+    fields = {name: getattr(drawn, name) for name in ("size", "color", "base", "goal", "symmetry")}
+    return types.State(**fields, poses=poses, placed=placed, ready=ready)
+
+
+def unstacked(drawn: types.Scene) -> list[types.Scene]:
+    """Give the scenes of a batch one by one, as NumPy."""
+    whole = jax.tree.map(np.asarray, drawn)
+    return [jax.tree.map(lambda leaf: leaf[i], whole) for i in range(len(whole.size))]  # noqa: B023
+
+
+def training_step(config) -> timing.Work:
+    """Take training steps: draw, augment, render, fuse, loss, gradient, update."""
+    recipe, states, key = build.recipe(config), states_of(config, BATCH), jax.random.key(0)
+    fresh = jax.jit(lambda key: state.create(recipe.policy.init(key), recipe.optimizer))(jax.random.key(0, impl="rbg"))
+    step = compiling.jit(functools.partial(train_step.train_step, recipe), donate_argnums=0)
+    return timing.stepping(step, fresh, states, key, recipe.policy.frozen, count=recipe.batch_size)
+
+
+def paper_step(config) -> timing.Work:
+    """Take a step of the paper's two-stream agent at its own size."""
+    return training_step(options.load(f"configs/{config.task.name}.py:paper"))
+
+
+def paper_example(rows: int, cols: int) -> dict[str, Any]:
+    """Draw maps `[rows, cols, 6]` as public code has them (colours, and thrice the height), a pick, and its place and bin; all NumPy."""
+    rng = np.random.default_rng(0)
+    current, goal = (np.concatenate([rng.normal(size=(rows, cols, 3)), *[rng.normal(size=(rows, cols, 1))] * 3], -1) for _ in range(2))
+    pick, place = (rng.integers((rows, cols)) for _ in range(2))
+    maps = {"current": current.astype(np.float32), "goal": goal.astype(np.float32)}
+    return {**maps, "pick": pick.astype(np.int32), "place": place.astype(np.int32), "bin": np.int32(1)}
+
+
+def paper_losses(net: transporter.Transporter, params: Any, example: dict[str, Any]) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """Give the sum of pick's and place's one-hot cross-entropies, and the logits."""
+    logits, _ = net.apply({"params": params}, example["current"], example["goal"], example["pick"])
+    rows, cols = logits["pick"].shape
+    at = example["pick"][0] * cols + example["pick"][1] == jnp.arange(rows * cols)
+    place = losses.place_cross_entropy(logits["place"], example["bin"][None], example["place"][None], jnp.ones(1, bool))
+    return losses.masked_cross_entropy(logits["pick"], at) + place, logits
+
+
+def drawn_leaf(rng: np.random.Generator, leaf: jax.ShapeDtypeStruct) -> jax.Array:
+    """Draw a kernel that keeps the size of what goes through it, or a bias; without the minute that it takes to compile `init`."""
+    return jnp.asarray(rng.normal(size=leaf.shape) * np.prod(leaf.shape[:-1]) ** -0.5, jnp.float32)
+
+
+def paper_network(config, *, rows: int = 320, cols: int = 160, **sizes) -> timing.Work:
+    """Take plain steps of the paper's two-stream network on given maps, one example at a time: loss, gradient, Adam."""
+    del config
+    net, optimizer, example = transporter.Transporter(**sizes), optax.adam(1e-4), jax.tree.map(jnp.asarray, paper_example(rows, cols))
+
+    def step(run, example):
+        params, moments = run
+        grads, logits = jax.grad(lambda params: paper_losses(net, params, example), has_aux=True)(params)
+        updates, moments = optimizer.update(grads, moments)
+        return (optax.apply_updates(params, updates), moments), {name: leaf.max() for name, leaf in logits.items()}
+
+    shapes = jax.eval_shape(lambda key: net.init(key, example["current"], example["goal"], example["pick"])["params"], jax.random.key(0))
+    params = jax.tree.map(functools.partial(drawn_leaf, np.random.default_rng(0)), shapes)
+    return timing.stepping(compiling.jit(step, donate_argnums=0), (params, optimizer.init(params)), example)
+
+
+def correlate_torch(config, **sizes) -> timing.Work:
+    """Do what `correlate` does with PyTorch's conv2d."""
+    from experiments import benchmark_torch  # needs an extra
+
+    del config
+    return benchmark_torch.correlate(**sizes)
+
+
+def paper_torch(config, *, rows: int = 320, cols: int = 160, **sizes) -> timing.Work:
+    """Do what `paper_network` does with PyTorch."""
+    from experiments import benchmark_torch  # needs an extra
+
+    del config
+    return benchmark_torch.steps(paper_example(rows, cols), **sizes)
+
+
+def input_pipeline(config) -> timing.Work:
+    """Draw, augment, render and fuse the examples of a training step."""
+    recipe, states = build.recipe(config), states_of(config, BATCH)
+
+    def inputs(key, states):
+        key_batch, key_augment, key_noise = jax.random.split(key, 3)
+        index = jax.random.randint(key_batch, (recipe.batch_size,), 0, states.size.shape[0])
+        examples = jax.tree.map(lambda leaf: leaf[index], states)
+        how = {"observer": recipe.observer, "recolor": recipe.recolor, "mix": recipe.mix, "rigid": recipe.rigid}
+        disturb = jax.vmap(functools.partial(train_step.augmented, **how))
+        return train_step.observations(recipe, key_noise, disturb(jax.random.split(key_augment, recipe.batch_size), examples))
+
+    return timing.compiled(inputs, jax.random.key(0), states, count=recipe.batch_size)
+
+
+def primitive(config) -> timing.Work:
+    """Carry out one right action with the arm."""
+    task = build.task(config)
+    drawn = task.sample(1)
+    world = physics.World(task, drawn)
+    action = oracle.act(task, drawn, drawn.start, np.random.default_rng(0))
+
+    def run():
+        world.reset(drawn.start)
+        world.step(action)
+
+    return timing.Work(run)
+
+
+def collection(config) -> timing.Work:
+    """Record demonstrations of the oracle."""
+    task, seeds = build.task(config), build.split_seeds("train", 0, recording.SHARD)
+    made = len(recording.demonstrate(task, seeds, threads=config.data.threads))
+    return timing.Work(lambda: recording.demonstrate(task, seeds, threads=config.data.threads), made)
+
+
+def evaluation(config, *, parallel: int = 25) -> timing.Work:
+    """Run the closed loop with the weights that ship."""
+    path = f"pretrained/{config.task.name}"
+    agent, observer = build.build_policy(config), build.observer(config)
+    params = scoring.check_checkpoint(path, config, agent)
+    seeds = build.split_seeds("val", 0, parallel)
+
+    def run():
+        scoring.evaluate(agent, params, observer, seeds=seeds, parallel=parallel, threads=config.data.threads)
+
+    return timing.Work(run, parallel)
+
+
+def trained_state(config) -> tuple[state.TrainState, dict[str, Any]]:
+    """Make a fresh training state, and what is stored beside it."""
+    recipe = build.recipe(config)
+    fresh = jax.jit(lambda key: state.create(recipe.policy.init(key), recipe.optimizer))(jax.random.key(0, impl="rbg"))
+    return fresh, {"config": options.to_dict(config), "input_spec": build.input_spec(config)}
+
+
+def save(config) -> timing.Work:
+    """Write a checkpoint, checksums and all."""
+    fresh, stored = trained_state(config)
+    folder, steps = tempfile.TemporaryDirectory(), itertools.count(1)
+    store = checkpoint.Checkpoints(folder.name)
+
+    return timing.Work(lambda: store.save_latest(next(steps), fresh, **stored), close=folder.cleanup)
+
+
+def restore(config) -> timing.Work:
+    """Read a checkpoint and verify it."""
+    fresh, stored = trained_state(config)
+    folder = tempfile.TemporaryDirectory()
+    store = checkpoint.Checkpoints(folder.name)
+    store.save_latest(1, fresh, **stored)
+    return timing.Work(lambda: store.restore_latest(fresh), close=folder.cleanup)
+
+
+def start_up(config) -> timing.Work:
+    """Start Python and import the package."""
+    del config
+    return timing.Work(lambda: subprocess.run([sys.executable, "-c", "import lala_jax"], check=True))
+
+
+def first_step(config, *, cached: bool) -> timing.Work:
+    """Start Python, import, build and take one training step; without kept programs, or with those that such a start has left before."""
+    folder = tempfile.TemporaryDirectory()
+    keep = {"JAX_ENABLE_COMPILATION_CACHE": str(cached).lower(), "JAX_COMPILATION_CACHE_DIR": folder.name}
+    command, request = [sys.executable, "-m", "experiments.benchmark_start"], json.dumps(options.to_dict(config))
+
+    def run():
+        done = subprocess.run(command, input=request, env={**os.environ, **keep}, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise RuntimeError(f"a first training step ended with status {done.returncode}:\n{done.stderr}")
+
+    if cached:
+        run()
+    return timing.Work(run, close=folder.cleanup)
+
+
+CEILINGS = {"matmul": "flops", "copy": "bytes"}
+STAGES = {
+    "matmul": timing.Stage("matrix product 2048 x 2048", "product", matrix_product),
+    "copy": timing.Stage("reading and writing 256 MB", "copy", copy),
+    "import": timing.Stage("starting Python and importing lala_jax", "start", start_up),
+    "first-step": timing.Stage("from starting Python to the first training step", "start", functools.partial(first_step, cached=False)),
+    "first-step-cached": timing.Stage("the same with programs kept from before", "start", functools.partial(first_step, cached=True)),
+    "render": timing.Stage("render 4 views of 640 x 480", "observation", lambda config: render_views(full_size(config))),
+    "render-mujoco": timing.Stage(
+        "the same with mujoco.Renderer", "observation", lambda config: render_mujoco(full_size(config)), alone=True, environment=EGL
+    ),
+    "fuse": timing.Stage("unproject and fuse them", "observation", lambda config: fuse(full_size(config))),
+    "observe": timing.Stage("render, unproject and fuse", "observation", lambda config: observe(full_size(config))),
+    "observe-compact": timing.Stage("the same at the config's resolution", "observation", observe),
+    "backbone": timing.Stage("fuse with ResNet-50 features", "observation", features),
+    "act": timing.Stage("act", "action", act),
+    "correlate": timing.Stage("correlation and its gradient, in the spectrum", "sample", lambda config: correlate(config, method="fft")),
+    "correlate-direct": timing.Stage("the same directly", "sample", lambda config: correlate(config, method="conv"), alone=True),
+    "correlate-torch": timing.Stage("the same with PyTorch's conv2d", "sample", correlate_torch, alone=True, needs=("torch",)),
+    "inputs": timing.Stage("examples of a training step", "sample", input_pipeline),
+    "train": timing.Stage("training step", "sample", training_step),
+    "train-paper": timing.Stage("training step, paper's size", "sample", paper_step),
+    "train-paper-network": timing.Stage("the same on given maps without a backbone", "sample", paper_network, alone=True),
+    "train-paper-torch": timing.Stage("that with PyTorch", "sample", paper_torch, alone=True, needs=("torch",)),
+    "primitive": timing.Stage("one action of the arm", "action", primitive),
+    "collect": timing.Stage("demonstrations", "demonstration", collection),
+    "evaluate": timing.Stage("closed loop", "episode", evaluation),
+    "save": timing.Stage("save a checkpoint", "checkpoint", save),
+    "restore": timing.Stage("restore a checkpoint", "checkpoint", restore),
+}
+
+
+# How cost grows
+
+
+def many_boxes(config, count: int) -> timing.Work:
+    """Render `count` boxes on a table, in a grid."""
+    cameras, side = build.observer(config).camera, int(np.ceil(np.sqrt(count)))
+    spec = mujoco.MjSpec()
+    spec.add_material(name="plain")  # MJX wants one
+    spec.worldbody.add_geom(name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 0.05], rgba=[*scene.TABLE_COLOR, 1.0])
+    for i, (x, y) in enumerate(itertools.islice(itertools.product(np.linspace(0.3, 0.7, side), np.linspace(-0.4, 0.4, side)), count)):
+        spec.worldbody.add_geom(
+            name=f"object{i}", type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.02] * 3, pos=[x, y, 0.02], rgba=[0.5, 0.5, 0.5, 1.0]
+        )
+    for geom in spec.geoms:
+        geom.contype = geom.conaffinity = 0
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    put = render.mjx.put_model(model), render.mjx.put_data(model, data)
+    layer = render.background(*put, cameras, geoms=(0,), segmentation=False)
+    return timing.compiled(lambda model, data: render.render_over(layer, model, data, cameras, geoms=scene.object_geoms(model)), *put)
+
+
+def some_views(config, count: int) -> timing.Work:
+    """Render and fuse one scene with `count` cameras: the preset's, over and over."""
+    observer, (drawn, poses) = build.observer(config), scenes_of(config, 1)
+    which = jnp.arange(count) % len(observer.camera.intrinsics)
+    layer = jax.tree.map(lambda leaf: leaf[which], observer.background())
+
+    def maps(size, color, base, poses):
+        return topdown.from_views(observer.views(size, color, base, poses, layer), spec=observer.spec)
+
+    return timing.compiled(maps, *(leaf[0] for leaf in (drawn.size, drawn.color, drawn.base, poses)))
+
+
+def with_cells(config, rows: int) -> timing.Work:
+    """Fuse to a map of `rows` rows and half as many columns."""
+    return fuse(resized(config, **{"map.cell": 1.0 / rows}))
+
+
+def with_batch(config, batch: int) -> timing.Work:
+    """Take training steps of another batch size."""
+    return training_step(resized(config, **{"train.batch_size": batch}))
+
+
+def with_episodes(config, count: int) -> timing.Work:
+    """Let the oracle act in `count` episodes at once."""
+    task, seeds = build.task(config), build.split_seeds("val", 0, count)
+    drawn = [task.sample(seed) for seed in seeds]
+
+    def run():
+        rollout.run(task, drawn, seeds, rollout.oracle_agent(task, drawn, seeds, "oracle"), threads=config.data.threads, max_actions=1)
+
+    return timing.Work(run, count)
+
+
+GROWTH = {
+    "views": ("render and fuse, by the number of views", (1, 2, 4, 8), some_views),
+    "boxes": ("render, by the number of boxes", (2, 4, 8, 16, 32, 64), many_boxes),
+    "cells": ("fuse, by the number of rows of the map", (80, 160, 320, 640), with_cells),
+    "rotations": (
+        "correlation and its gradient, by the number of rotations",
+        (12, 24, 36, 72),
+        lambda config, count: correlate(config, method="fft", rotations=count),
+    ),
+    "batch": ("training step a sample, by the batch size", (1, 4, 16, 64), with_batch),
+    "episodes": ("one action of the oracle an episode, by the episodes at once", (1, 8, 64, 512), with_episodes),
+}
+
+
+def grow(name: str, config, repeats: int) -> dict[str, Any]:
+    """Time one thing at several sizes."""
+    label, values, prepare = GROWTH[name]
+    print(f"{name}: {label}", flush=True)
+    rows = [{"value": value, **timing.measured(prepare(config, value), repeats)} for value in values]
+    return {"name": name, "label": label, "rows": rows}
+
+
+if __name__ == "__main__":
+    timing.serve(STAGES)

@@ -1,0 +1,179 @@
+"""Time one thing, here or in a process of its own: medians, rates and memory."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import importlib
+import json
+import os
+import pathlib
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+from lala_jax import compiling, options
+
+SECONDS = 20.0  # after so long a stage is not repeated again
+LIMIT = 900.0  # seconds that a process of its own may take
+COMPILED = "/jax/core/compile/backend_compile_duration"  # what JAX says when it has compiled a program, or read a kept one
+STATUS = pathlib.Path("/proc/self/status")  # where Linux says how much memory a process takes, and how much it took at most
+
+
+class Unavailable(RuntimeError):
+    """What a stage needs is not on this machine."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Work:
+    """Something to time."""
+
+    run: Callable[[], Any]  # does it once and waits for the result
+    count: int = 1  # things that one run does
+    facts: Mapping[str, float] = dataclasses.field(default_factory=dict)  # of one run: flops, bytes, memory; and compile_seconds
+    close: Callable[[], Any] = lambda: None  # gives back what it took
+
+
+@dataclasses.dataclass(frozen=True)
+class Stage:
+    """A row: what is timed, and what one of it is."""
+
+    label: str
+    unit: str
+    prepare: Callable[[Any], Work]
+    alone: bool = False  # in a process of its own, which may be slow or run out of memory
+    needs: tuple[str, ...] = ()  # modules that such a process imports first
+    environment: Mapping[str, str] = dataclasses.field(default_factory=dict)  # of such a process, where the user's does not say
+
+
+def compiled(function: Callable[..., Any], *arguments: Any, count: int = 1) -> Work:
+    """Compile a function of arrays for its arguments: its run, and what XLA counts of it."""
+    program, facts = compiling.build(compiling.jit(function), *arguments)
+    return Work(lambda: jax.block_until_ready(program(*arguments)), count, facts)
+
+
+def stepping(step, run: Any, *inputs: Any, count: int = 1) -> Work:
+    """Compile `step(run, *inputs)`, jitted, which gives the next run and metrics: each of its runs takes one step more."""
+    program, facts = compiling.build(step, run, *inputs)
+    held = [run]
+
+    def take():
+        held[0], metrics = program(held[0], *inputs)
+        jax.block_until_ready((held[0], metrics))
+
+    return Work(take, count, facts)
+
+
+def measured(work: Work, repeats: int) -> dict[str, Any]:
+    """Run some work once to warm up and then up to `repeats` times: seconds a thing, and rates; a warm-up of over SECONDS stays alone."""
+    runs, begin = [], time.perf_counter()
+    with contextlib.closing(work):
+        work.run()
+        before = len(compilations())
+        if (first := time.perf_counter() - begin) > SECONDS:
+            runs.append(first / work.count)
+        begin = time.perf_counter()
+        while first <= SECONDS and len(runs) < repeats and (not runs or time.perf_counter() - begin < SECONDS):
+            start = time.perf_counter()
+            work.run()
+            runs.append((time.perf_counter() - start) / work.count)
+    again = len(compilations()) - before
+    seconds = float(np.median(runs))
+    rates = {f"{name}_per_second": work.facts[name] / work.count / seconds for name in ("flops", "bytes") if name in work.facts}
+    spread = {"seconds": seconds, "lowest": min(runs), "highest": max(runs), "runs": len(runs), "count": work.count}
+    return {**spread, "recompiled": again, **work.facts, **rates}
+
+
+@functools.cache
+def compilations() -> list[str]:
+    """Give the names of the programs that JAX compiled in this process since the first call: the list grows."""
+    names: list[str] = []
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda event, _, fun_name="", **__: names.append(fun_name) if event == COMPILED else None
+    )
+    return names
+
+
+def timed(name: str, stages: Mapping[str, Stage], config, repeats: int) -> dict[str, Any]:
+    """Time a stage: a row with the median and the extremes of a thing in seconds; or why it could not run."""
+    stage = stages[name]
+    row = {"name": name, "label": stage.label, "unit": stage.unit}
+    try:
+        if stage.alone:
+            return row | alone(name, stage, config, repeats)
+        return row | measured(stage.prepare(config), repeats) | device_memory()
+    except Unavailable as error:
+        return {**row, "unavailable": str(error)}
+
+
+def device_memory() -> dict[str, float]:
+    """Give the most bytes that this process has had on the device so far, where the device counts them."""
+    stats = jax.devices()[0].memory_stats() or {}
+    return {"device_memory_peak": float(stats["peak_bytes_in_use"])} if "peak_bytes_in_use" in stats else {}
+
+
+# A process of its own
+
+
+def alone(name: str, stage: Stage, config, repeats: int) -> dict[str, Any]:
+    """Time a stage of `benchmark_stages` in a new process, which `serve`s it; raises Unavailable where it fails or takes over LIMIT."""
+    request = json.dumps({"name": name, "config": options.to_dict(config), "repeats": repeats})
+    command = [sys.executable, "-m", "experiments.benchmark_stages"]
+    try:
+        done = subprocess.run(
+            command, input=request, capture_output=True, text=True, env={**stage.environment, **os.environ}, timeout=LIMIT, check=False
+        )
+    except subprocess.TimeoutExpired:
+        raise Unavailable(f"not done after {LIMIT:.0f} s") from None
+    if done.returncode:
+        last = (done.stderr.strip().splitlines() or [""])[-1]
+        raise Unavailable(f"ended with status {done.returncode}: {last[:300]}")
+    row = json.loads(done.stdout.splitlines()[-1])
+    if "unavailable" in row:
+        raise Unavailable(row["unavailable"])
+    return row
+
+
+def serve(stages: Mapping[str, Stage]) -> None:
+    """Time the stage that standard input asks for, and write its row as the last line of standard output.
+
+    On Linux `process_memory` is the most that running it took, in bytes, over what the process took once the modules were imported;
+    compiling is not in it, but for what it left.
+    """
+    request = json.load(sys.stdin)
+    stage, config = stages[request["name"]], options.from_dict(request["config"])
+    try:
+        for module in stage.needs:
+            try:
+                importlib.import_module(module)
+            except ImportError as error:
+                raise Unavailable(f"needs {module}: {error}") from error
+        before = memory("VmRSS")
+        work = stage.prepare(config)
+        forget_peak()
+        row = measured(work, request["repeats"])
+        if before is not None:
+            row["process_memory"] = memory("VmHWM") - before
+        row |= device_memory()
+    except Unavailable as error:
+        row = {"unavailable": str(error)}
+    print(f"\n{json.dumps(row)}", flush=True)
+
+
+def memory(field: str) -> float | None:
+    """Read a field of `STATUS` in bytes: VmRSS, what this process takes now, or VmHWM, the most since `forget_peak`; None elsewhere."""
+    if not STATUS.exists():
+        return None
+    return 1024.0 * next(int(line.split()[1]) for line in STATUS.read_text().splitlines() if line.startswith(f"{field}:"))
+
+
+def forget_peak() -> None:
+    """Let VmHWM begin at what this process takes now."""
+    if STATUS.exists():
+        STATUS.with_name("clear_refs").write_text("5")
