@@ -104,8 +104,9 @@ def run(
         plain = not bar.console.is_terminal  # a log file gets a line now and then instead of a bar
         first = int(current.step) + 1
         shown = bar.add_task("training", total=total, completed=first - 1, note="compiling")
-        step = prepare(current) if first <= total else None
+        step = None
         for number in range(first, total + 1):
+            step = step or prepare(current)
             start = time.time()
             current, metrics = step(current)
             seen.append(metrics)
