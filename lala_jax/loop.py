@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from rich import progress
 
-from lala_jax import checkpoint, options, state, writers
+from lala_jax import checkpoint, options, parallel, state, writers
 
 Metrics = Mapping[str, jax.Array]
 
@@ -39,10 +39,19 @@ def mean_metrics(seen: Sequence[Metrics], *, last: int) -> dict[str, float]:
 
 
 def start_or_resume(
-    fresh: state.TrainState, store: checkpoint.Checkpoints, config, settings: Callable[[Mapping[str, Any]], dict[str, Any]]
+    fresh: state.TrainState,
+    store: checkpoint.Checkpoints,
+    config,
+    settings: Callable[[Mapping[str, Any]], dict[str, Any]],
+    *,
+    mesh: jax.sharding.Mesh | None = None,
+    shard: bool = False,
 ) -> state.TrainState:
-    """Give the newest intact state of the store, or `fresh`; raises CheckpointError where it is of a run with other `settings`."""
-    fresh = jax.device_put(fresh, jax.devices()[0])  # committed to it, as what is restored: both then run one compiled step
+    """Give the newest intact state of the store, or `fresh`, on the devices of `mesh`, or the one there is (`parallel.place`).
+
+    Raises CheckpointError where what is stored is of a run with other `settings`.
+    """
+    fresh = parallel.place(fresh, mesh, shard=shard)  # committed, as what is restored: both then run one compiled step
     found = store.restore_latest(fresh)
     if found is None:
         return fresh
@@ -62,18 +71,19 @@ def run(
     save_every: int,
     save: Callable[[int, state.TrainState], None],
     note: Callable[[Mapping[str, float]], str],
-    writer: writers.Writer,
+    writer: writers.Writer | None,
     stopped: Callable[[], bool],
     after: Callable[[int, state.TrainState], bool] = lambda *_: False,
 ) -> state.TrainState:
     """Take steps up to `total`, log means and save now and then; leave early, saved, once `stopped()`.
 
     `note` puts the means into a few words. `save` and `after` get a step's number and state; `after`, called past every step that
-    did not leave, says whether it did anything, the time of which is then not the steps'.
+    did not leave, says whether it did anything, the time of which is then not the steps'. Of several processes all run the loop, and
+    leave it at the step at which one is `stopped()`; a process without a `writer` says nothing.
     """
     seen, begin = [], time.time()
     columns = (*progress.Progress.get_default_columns(), progress.MofNCompleteColumn(), progress.TextColumn("{task.fields[note]}"))
-    with progress.Progress(*columns, speed_estimate_period=600) as bar:
+    with progress.Progress(*columns, speed_estimate_period=600, disable=writer is None) as bar:
         plain = not bar.console.is_terminal  # a log file gets a line now and then instead of a bar
         shown = bar.add_task("training", total=total, completed=int(current.step), note="compiling")
         for number in range(int(current.step) + 1, total + 1):
@@ -82,13 +92,14 @@ def run(
             if number % log_every == 0 or number == total:
                 values = mean_metrics(seen, last=number)
                 values["seconds_per_step"], seen, begin = (time.time() - begin) / len(seen), [], time.time()
-                writer.scalars(number, values)
                 bar.update(shown, note=note(values))
-                if plain:
+                if writer is not None:
+                    writer.scalars(number, values)
+                if writer is not None and plain:
                     left = (total - number) * values["seconds_per_step"] / 60
                     print(f"step {number} of {total}: {note(values)}; {left:.0f} minutes left", flush=True)
             bar.update(shown, completed=number)
-            leaving = stopped()
+            leaving = parallel.anywhere(stopped())
             if number % save_every == 0 or number == total or leaving:
                 mean_metrics([metrics], last=number)
                 save(number, current)
