@@ -69,13 +69,25 @@ def _number(environ: Mapping[str, str], name: str) -> int:
 def initialize() -> None:
     """Join the other processes of the run where `launched` finds any; to be called before JAX is first used."""
     told = launched(os.environ)
-    if told is not None and not jax.distributed.is_initialized():
-        jax.distributed.initialize(**told)
+    if told is None or jax.distributed.is_initialized():
+        return
+    jax.distributed.initialize(**told)
+    if jax.process_count() > 1:
+        _client().wait_at_barrier("lala_jax/start", PATIENCE)
+        anywhere(False)  # the first exchange between CPUs finds its peers within 30 s or fails: now, while they keep step
 
 
 def is_first() -> bool:
     """Say whether this is the process that writes, prints and evaluates."""
     return jax.process_index() == 0
+
+
+def _client():
+    """Give JAX's own store of keys and values, which has no public name; there is one where there are several processes."""
+    from jax._src import distributed
+
+    assert distributed.global_state.client is not None
+    return distributed.global_state.client
 
 
 _turns = itertools.count()
@@ -88,10 +100,7 @@ def first(work: Callable[[], T]) -> T:
     """
     if jax.process_count() == 1:
         return work()
-    from jax._src import distributed  # JAX's own store of keys and values has no public name
-
-    client, key = distributed.global_state.client, f"lala_jax/{next(_turns)}"
-    assert client is not None  # there are several processes
+    client, key = _client(), f"lala_jax/{next(_turns)}"
     if not is_first():
         answer, failure = pickle.loads(client.blocking_key_value_get_bytes(key, PATIENCE))
         if failure:

@@ -39,23 +39,31 @@ def simulate(devices, *arguments):
     assert done.returncode == 0, done.stderr[-4000:]
 
 
-def start_pair(*command):
-    """Start two processes of one run, on this machine."""
+@pytest.fixture
+def start_pair():
+    """Start two processes of one run, on this machine; none outlives the test."""
+    started = []
+    yield lambda *command: _start(started, *command)
+    for process in started:
+        with process:
+            process.kill()
+
+
+def _start(started, *command):
     with socket.socket() as free:
         free.bind(("localhost", 0))
         address = f"localhost:{free.getsockname()[1]}"
     told = [environment(JAX_COORDINATOR_ADDRESS=address, JAX_NUM_PROCESSES="2", JAX_PROCESS_ID=str(i)) for i in range(2)]
     how = {"cwd": ROOT, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    return [subprocess.Popen([sys.executable, *map(str, command)], env=env, **how) for env in told]
+    pair = [subprocess.Popen([sys.executable, *map(str, command)], env=env, **how) for env in told]
+    started.extend(pair)
+    return pair
 
 
 def finish(pair):
-    """Wait for both: `(status, out, err)` of each. They are ended whatever happens."""
-    try:
-        return [(*reversed([process.communicate(timeout=500), process.returncode]),) for process in pair]
-    finally:
-        for process in pair:
-            process.kill()
+    """Wait for both: what each said, `(out, err)`, and their statuses."""
+    said = [process.communicate(timeout=500) for process in pair]
+    return said, [process.returncode for process in pair]
 
 
 def stored(directory, name):
@@ -139,10 +147,10 @@ def test_damage_to_a_split_state_is_caught(eight):
     assert checkpoint.Checkpoints(eight).restore_latest(template)[0] == 3
 
 
-def test_processes_share_answers_failures_and_checkpoints(tmp_path):
+def test_processes_share_answers_failures_and_checkpoints(start_pair, tmp_path):
     """And what two wrote one reads."""
-    pair = finish(start_pair("tests/parallel_program.py", "processes", tmp_path))
-    assert [status for status, *_ in pair] == [0, 0], pair[0][1][1][-3000:] + pair[1][1][1][-3000:]
+    said, status = finish(start_pair("tests/parallel_program.py", "processes", tmp_path))
+    assert status == [0, 0], said
     assert (tmp_path / "done-0").exists() and (tmp_path / "done-1").exists()
     assert sorted(path.name for path in (tmp_path / "checkpoints" / "latest").iterdir()) == ["2", "2.json"]
     found, *_ = checkpoint.load(tmp_path / "checkpoints")
@@ -160,19 +168,19 @@ def rows(workdir):
     return {line["step"]: line["loss"] for line in lines if "loss" in line}
 
 
-def test_two_processes_are_one_run(tmp_path):
+def test_two_processes_are_one_run(start_pair, tmp_path):
     """One is told to stop, both do, at one step; started again they finish; one process could have gone on; one set of files."""
     workdir, changes = tmp_path / "run", (*OVERRIDES, *SMALL, f"data.directory={tmp_path / 'data'}")
     arguments = ["--config=configs/tower.py:smoke", f"--workdir={workdir}", *(f"--config.{text}" for text in changes)]
     pair = start_pair("-m", "lala_jax.train", *arguments)
     while not (workdir / "metrics.jsonl").exists() or not rows(workdir):
-        assert pair[0].poll() is None, pair[0].communicate()
+        assert pair[0].poll() is None, pair[0].communicate()[1]
         time.sleep(0.02)
     pair[1].send_signal(signal.SIGTERM)
-    pair = finish(pair)
+    ((out, err), (silence, _)), status = finish(pair)
     stopped = max(rows(workdir))
-    assert stopped < 4 and [status for status, _ in pair] == [1, 1], pair
-    assert f"stopped at step {stopped}" in pair[0][1][1] and "step 1 of 4" in pair[0][1][0] and not pair[1][1][0]
+    assert stopped < 4 and status == [1, 1], err
+    assert f"stopped at step {stopped}" in err and "step 1 of 4" in out and not silence
     assert int(checkpoint.load(workdir / "checkpoints", which="latest")[0]["step"]) == stopped
 
     config = options.load("configs/tower.py:smoke", changes)
@@ -185,9 +193,9 @@ def test_two_processes_are_one_run(tmp_path):
             seen[number] = float(metrics["loss"])
     assert sorted(late) == list(range(stopped + 1, 5))
 
-    pair = finish(start_pair("-m", "lala_jax.train", *arguments))
-    assert [status for status, _ in pair] == [0, 0], pair
-    assert "val split, 1 episodes: score" in pair[0][1][0] and not pair[1][1][0]
+    ((out, err), (silence, _)), status = finish(start_pair("-m", "lala_jax.train", *arguments))
+    assert status == [0, 0], err
+    assert "val split, 1 episodes: score" in out and not silence
     np.testing.assert_allclose([rows(workdir)[number] for number in losses], list(losses.values()), rtol=1e-4)
     np.testing.assert_allclose([late[number] for number in late], [losses[number] for number in late], rtol=1e-4)
     lines = (workdir / "metrics.jsonl").read_text().splitlines()
