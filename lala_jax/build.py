@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from lala_jax import (
     observe,
     optim,
     options,
+    parallel,
     policy,
     policy_cliport,
     pretrain_step,
@@ -34,7 +36,7 @@ SPLITS = ("train", "val", "test")
 TEST_START = 10_001
 WORKDIR = "runs/<task>"  # the default of --workdir
 SELECTION_START = 4000  # the place in the val split from which episodes choose the best checkpoint: far from those reported
-USER_ERRORS = (dataset.DatasetError, checkpoint.CheckpointError, base.NoFreePose)  # their messages say all
+USER_ERRORS = (dataset.DatasetError, checkpoint.CheckpointError, base.NoFreePose, parallel.PeerError)  # their messages say all
 
 
 def workdir(config: Mapping[str, Any], given: str) -> str:
@@ -197,6 +199,17 @@ def recipe(config: Mapping[str, Any]) -> train_step.Recipe:
     )
 
 
+Recipe = TypeVar("Recipe", train_step.Recipe, pretrain_step.Recipe)
+
+
+def on_devices(recipe: Recipe, config: Mapping[str, Any], *, group: str) -> Recipe:
+    """Let all devices share the recipe's batches, whose size is a field of `group`; as it is where there is one device."""
+    mesh = parallel.mesh(f"{group}.batch_size", recipe.batch_size)
+    if mesh is None:
+        return recipe
+    return dataclasses.replace(recipe, mesh=mesh, shard_state=config["train"].get("shard_state", False))  # configs may be older
+
+
 def pretrain_recipe(config: Mapping[str, Any]) -> pretrain_step.Recipe:
     """Build the facts of a step of pre-training from the groups `pretrain`, `task`, `camera`, `optim` and `augment`."""
     fields, camera, augment, optimiser = config["pretrain"], config["camera"], config["augment"], dict(config["optim"])
@@ -237,10 +250,10 @@ def pretrain_settings(config: Mapping[str, Any]) -> dict[str, Any]:
 def run_settings(config: Mapping[str, Any]) -> dict[str, Any]:
     """List the fields that make a run what it is, by dotted name: all but those that say how often to report and where data lie.
 
-    Nor does pre-training, a run of its own, belong to it.
+    Nor does pre-training, a run of its own, belong to it, nor where the state lies.
     """
     free = ("pretrain.", "eval.", "data.directory", "data.threads")
-    free += ("train.log_every", "train.save_every", "train.eval_every", "train.eval_episodes")
+    free += ("train.log_every", "train.save_every", "train.eval_every", "train.eval_episodes", "train.shard_state")
     return {name: value for name, value in (NEWER | options.fields(config)).items() if not name.startswith(free)}
 
 

@@ -7,6 +7,11 @@
 Orbax stores no checksum of its payload and loads most flipped bytes silently. So the side file is written last, by one rename: a
 step exists from then on, and is intact when its files and leaves match. The files are compared before Orbax sees them, which on
 damaged ones leaves failed background tasks behind. Leaves are named by their path in the pytree (`params/Dense_0/kernel`).
+
+A leaf that is split over devices is written by Orbax in its parts, each process its own, into one directory that all share; all else the
+first process writes. A checksum is of the whole leaf, which is gathered for it one at a time, so that it does not depend on how the leaf
+was split. Reading gives every process whole leaves, compares them, and only then puts them where the template's are, however many
+devices that is.
 """
 
 from __future__ import annotations
@@ -27,7 +32,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lala_jax import writers
+from lala_jax import parallel, writers
 
 FORMAT_VERSION = 1
 
@@ -64,7 +69,7 @@ class Checkpoints:
         """
         folder = self.directory / "latest"
         self._drop_damaged(folder)
-        newer = [other for other in _steps(folder) if other > step]
+        newer = parallel.first(lambda: [other for other in _steps(folder) if other > step])
         if newer:
             raise CheckpointError(f"{folder} holds step {newer[0]} already, newer than {step}: restore it, or choose another directory")
         _save(folder, step, state, {"config": config, "input_spec": input_spec, "score": None})
@@ -76,8 +81,8 @@ class Checkpoints:
             raise CheckpointError(f"score of step {step} must be finite, got {score}")
         folder = self.directory / "best"
         self._drop_damaged(folder)
-        before = _steps(folder)
-        if any(score < _stored_score(folder, other) for other in before):
+        before, better = parallel.first(lambda: (_steps(folder), [_stored_score(folder, other) > score for other in _steps(folder)]))
+        if any(better):
             return False
         _save(folder, step, state, {"config": config, "input_spec": input_spec, "score": float(score)})
         _remove(folder, [other for other in before if other != step])
@@ -88,10 +93,12 @@ class Checkpoints:
 
         `template` is a pytree of arrays or `jax.ShapeDtypeStruct`; the state has its structure, and its shardings where it has
         any. Damaged steps are logged and passed over. Raises MismatchError naming the leaf, the stored and the expected shape
-        and dtype; CheckpointError where steps exist and none is intact.
+        and dtype; CheckpointError where steps exist and none is intact, or where processes do not see the same steps.
         """
         folder = self.directory / "latest"
         problems = []
+        if parallel.anywhere(parallel.first(lambda: _steps(folder)) != _steps(folder)):
+            raise CheckpointError(f"{folder} must be one directory that all processes share: they do not see the same steps in it")
         for step in _steps(folder):
             try:
                 return step, _restore(folder, step, template)
@@ -206,14 +213,9 @@ def named(tree: Any) -> dict[str, Any]:
 
 def _host(name: str, leaf: Any) -> np.ndarray:
     """Bring one leaf to the host, whole."""
-    if isinstance(leaf, jax.Array):
-        if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-            raise CheckpointError(f"leaf {name} is a typed PRNG key: store its seed, or jax.random.key_data of it")
-        if not leaf.is_fully_addressable:
-            if not leaf.is_fully_replicated:
-                raise CheckpointError(f"leaf {name} is sharded over processes ({leaf.sharding}): replicate it before saving")
-            leaf = leaf.addressable_data(0)
-    array = np.asarray(leaf)
+    if isinstance(leaf, jax.Array) and jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+        raise CheckpointError(f"leaf {name} is a typed PRNG key: store its seed, or jax.random.key_data of it")
+    array = parallel.fetch(leaf) if isinstance(leaf, jax.Array) else np.asarray(leaf)
     if array.dtype == object:
         raise CheckpointError(f"leaf {name} is {type(leaf).__name__}, not an array or a number")
     return array
@@ -232,20 +234,28 @@ def _save(folder: pathlib.Path, step: int, state: Any, facts: Mapping[str, Any])
     """Write the payload, then the side file, which makes it count."""
     from orbax.checkpoint import v1 as ocp
 
-    leaves = {name: _host(name, leaf) for name, leaf in named(state).items()}
+    leaves, described = {}, {}
+    for name, leaf in named(state).items():
+        array = _host(name, leaf)
+        leaves[name] = leaf if parallel.is_split(leaf) else array
+        described[name] = {"shape": array.shape, "dtype": str(array.dtype), "crc32": _crc(array)}
     if not leaves:
         raise CheckpointError(f"the state of step {step} has no leaves")
-    described = {name: {"shape": leaf.shape, "dtype": str(leaf.dtype), "crc32": _crc(leaf)} for name, leaf in leaves.items()}
     side = writers.plain({"version": FORMAT_VERSION, **facts, "leaves": described})
-    if _same(folder, step, side):
+    if parallel.first(lambda: _same(folder, step, side)):
         return  # as when a signal arrives right after a periodic save
     _remove(folder, [step])
     # Orbax refuses arrays without elements; their description says all there is to know
     ocp.save(folder / str(step), {name: leaf for name, leaf in leaves.items() if leaf.size} or {"empty": np.zeros(1)})
-    if jax.process_index() == 0:
-        files = [path for path in sorted((folder / str(step)).rglob("*")) if path.is_file()]
-        side["files"] = {path.relative_to(folder / str(step)).as_posix(): zlib.crc32(path.read_bytes()) for path in files}
-        writers.write_json(folder / f"{step}.json", {**side, "crc32": _digest(side)})
+    parallel.first(lambda: _commit(folder, step, side))
+
+
+def _commit(folder: pathlib.Path, step: int, side: Mapping[str, Any]) -> None:
+    """Write the side file of a payload that is on disk."""
+    files = [path for path in sorted((folder / str(step)).rglob("*")) if path.is_file()]
+    crcs = {path.relative_to(folder / str(step)).as_posix(): zlib.crc32(path.read_bytes()) for path in files}
+    side = {**side, "files": crcs}
+    writers.write_json(folder / f"{step}.json", {**side, "crc32": _digest(side)})
 
 
 def _same(folder: pathlib.Path, step: int, side: Mapping[str, Any]) -> bool:
@@ -260,14 +270,13 @@ def _same(folder: pathlib.Path, step: int, side: Mapping[str, Any]) -> bool:
 
 def _remove(folder: pathlib.Path, steps: Iterable[int]) -> None:
     """Take steps back, the side file first, without which a payload does not count; all processes wait for it."""
-    if jax.process_index() == 0:
+
+    def work():
         for step in steps:
             (folder / f"{step}.json").unlink(missing_ok=True)
             shutil.rmtree(folder / str(step), ignore_errors=True)
-    if jax.process_count() > 1:
-        from jax.experimental import multihost_utils
 
-        multihost_utils.sync_global_devices(f"removed from {folder.name}")
+    parallel.first(work)
 
 
 def _stored_score(folder: pathlib.Path, step: int) -> float:
@@ -336,9 +345,11 @@ def _read_payload(path: pathlib.Path, described: Mapping[str, Any]) -> dict[str,
     """Read the leaves and compare each with its description."""
     from orbax.checkpoint import v1 as ocp
 
-    empty = {name: np.zeros(leaf["shape"], jnp.dtype(leaf["dtype"])) for name, leaf in described.items() if 0 in leaf["shape"]}
+    whole = {name: np.zeros(leaf["shape"], jnp.dtype(leaf["dtype"])) for name, leaf in described.items()}  # on the host, not split
+    empty = {name: leaf for name, leaf in whole.items() if not leaf.size}
     try:
-        leaves = {**ocp.load(path), **empty} if len(empty) < len(described) else empty
+        wanted = {name: leaf for name, leaf in whole.items() if leaf.size}
+        leaves = {**ocp.load(path, wanted), **empty} if wanted else empty
     except Exception as error:  # Orbax and TensorStore raise many kinds and hide the reason in the cause
         reason = error.__cause__ or error
         raise CheckpointError(f"{path} is damaged: {type(reason).__name__} {str(reason)[:300]}") from error
@@ -364,5 +375,5 @@ def nest(leaves: Mapping[str, np.ndarray]) -> dict[str, Any]:
 def _place(array: np.ndarray, like: Any) -> Any:
     """Put a leaf where its template's is: a device, the host, or a Python number."""
     if isinstance(like, (jax.Array, jax.ShapeDtypeStruct)):
-        return jax.device_put(array, like.sharding)
+        return jax.device_put(array) if like.sharding is None else parallel.put(array, like.sharding)
     return array if isinstance(like, (np.ndarray, np.generic)) else array.item()

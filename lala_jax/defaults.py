@@ -88,6 +88,7 @@ def get(arg: str, *, task: str) -> ml_collections.ConfigDict:
     config.train.save_every = 200
     config.train.eval_every = 800
     config.train.eval_episodes = 20  # to choose the best checkpoint, val split
+    config.train.shard_state = False  # split parameters, their average and the optimiser's state over several devices
 
     config.pretrain = ml_collections.ConfigDict()  # of the backbone, by lala_jax.pretrain, to camera.stage; logged and saved as training is
     config.pretrain.start = "resnet50_imagenet_v1"  # weights to begin with: a name or a file, as camera.backbone; none: random ones

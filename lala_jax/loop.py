@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from rich import progress
 
-from lala_jax import checkpoint, compiling, options, state, writers
+from lala_jax import checkpoint, compiling, options, parallel, state, writers
 
 Metrics = Mapping[str, jax.Array]
 Step = Callable[[state.TrainState], tuple[state.TrainState, Metrics]]
@@ -45,13 +45,17 @@ def start_or_resume(
     config,
     settings: Callable[[Mapping[str, Any]], dict[str, Any]],
     frozen: Mapping[str, Any] | None = None,
+    *,
+    mesh: jax.sharding.Mesh | None = None,
+    shard: bool = False,
 ) -> state.TrainState:
-    """Give the newest intact state of the store, or `fresh`; raises CheckpointError where it is of a run with other `settings`.
+    """Give the newest intact state of the store, or `fresh`, on the devices of `mesh`, or the one there is (`parallel.place`).
 
-    `frozen` are entries of the input spec that must be those of the run, too.
+    Raises CheckpointError where what is stored is of a run with other `settings`. `frozen` are entries of the input spec that must be
+    those of the run, too.
     """
     frozen = frozen or {}
-    fresh = jax.device_put(fresh, jax.devices()[0])  # committed to it, as what is restored: both then run one compiled step
+    fresh = parallel.place(fresh, mesh, shard=shard)  # committed, as what is restored: both then run one compiled step
     found = store.restore_latest(fresh)
     if found is None:
         return fresh
@@ -65,10 +69,13 @@ def start_or_resume(
 
 def compiled(jitted, recipe: Any, current: state.TrainState, *inputs: Any) -> Step:
     """Compile `jitted(recipe, state, *inputs)`, whose recipe is static, say what a step needs, and give it as a function of the state."""
-    print("compiling the training step", flush=True)
+    told = parallel.is_first()
+    if told:
+        print("compiling the training step", flush=True)
     program, facts = compiling.build(jitted, recipe, current, *inputs)
     memory = f"{facts['memory'] / 2**20:,.0f} MiB" if "memory" in facts else "an unknown amount"
-    print(f"compiled in {facts['compile_seconds']:.0f} s; a step needs {memory} of memory", flush=True)
+    if told:
+        print(f"compiled in {facts['compile_seconds']:.0f} s; a step needs {memory} of memory", flush=True)
     return lambda current: program(current, *inputs)
 
 
@@ -88,7 +95,7 @@ def run(
     save_every: int,
     save: Callable[[int, state.TrainState], None],
     note: Callable[[Mapping[str, float]], str],
-    writer: writers.Writer,
+    writer: writers.Writer | None,
     stopped: Callable[[], bool],
     after: Callable[[int, state.TrainState], bool] = lambda *_: False,
 ) -> state.TrainState:
@@ -96,11 +103,12 @@ def run(
 
     `prepare` gives the step for states like `current`; it is called once, if there are steps to take, and its time is theirs. `note`
     puts the means into a few words. `save` and `after` get a step's number and state; `after`, called past every step that did not
-    leave, says whether it did anything, the time of which is then not the steps'.
+    leave, says whether it did anything, the time of which is then not the steps'. Of several processes all run the loop, and leave it at
+    the step at which one is `stopped()`; a process without a `writer` says nothing.
     """
     seen, begin = [], time.time()
     columns = (*progress.Progress.get_default_columns(), progress.MofNCompleteColumn(), progress.TextColumn("{task.fields[note]}"))
-    with progress.Progress(*columns, speed_estimate_period=600) as bar:
+    with progress.Progress(*columns, speed_estimate_period=600, disable=writer is None) as bar:
         plain = not bar.console.is_terminal  # a log file gets a line now and then instead of a bar
         first = int(current.step) + 1
         shown = bar.add_task("training", total=total, completed=first - 1, note="compiling")
@@ -112,18 +120,19 @@ def run(
             seen.append(metrics)
             if number <= first + 1:  # the second one says how long they take: the first may have had something to set up
                 jax.block_until_ready((current, metrics))
-            if number == first + 1 < total:
+            if number == first + 1 < total and writer is not None:
                 print(estimate(total - number, time.time() - start), flush=True)
             if number % log_every == 0 or number == total:
                 values = mean_metrics(seen, last=number)
                 values["seconds_per_step"], seen, begin = (time.time() - begin) / len(seen), [], time.time()
-                writer.scalars(number, values)
                 bar.update(shown, note=note(values))
-                if plain:
+                if writer is not None:
+                    writer.scalars(number, values)
+                if writer is not None and plain:
                     left = (total - number) * values["seconds_per_step"] / 60
                     print(f"step {number} of {total}: {note(values)}; {left:.0f} minutes left", flush=True)
             bar.update(shown, completed=number)
-            leaving = stopped()
+            leaving = parallel.anywhere(stopped())
             if number % save_every == 0 or number == total or leaving:
                 mean_metrics([metrics], last=number)
                 save(number, current)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,8 @@ from lala_jax.sim import distance, render, scene
 from lala_jax.sim.tasks import base
 
 BASELINE = 0.055  # metres between the two imagers of a RealSense D415
+
+Whole = Callable[[Callable[[jax.Array], jax.Array], jax.Array], jax.Array]
 
 
 @struct.dataclass
@@ -74,16 +77,20 @@ class Observer:
         model, data = scene.place(model, data, size=size, color=color, poses=poses, base=base)
         return render.render_over(layer, model, data, layer.camera, geoms=moving)
 
-    def look(self, size, color, base, poses, *, key: jax.Array | None = None, layer: render.Layer | None = None) -> types.Views:
+    def look(
+        self, size, color, base, poses, *, key: jax.Array | None = None, layer: render.Layer | None = None, whole: Whole | None = None
+    ) -> types.Views:
         """Render B scenes (leaves `[B, ...]`) as the cameras report them; `key` draws the depth noise where there is any.
 
-        `layer` (leaves `[B, V, ...]`) is the background of other cameras than the preset's.
+        `layer` (leaves `[B, V, ...]`) is the background of other cameras than the preset's. `whole(function, depth)` draws it where
+        the scenes are a share of those that `key` is for.
         """
         views = jax.vmap(self.views)(size, color, base, poses, layer)
         if self.depth_noise:
             if key is None:
                 raise ValueError("Observer(depth_noise=True) needs a key to draw the noise")
-            views = views.replace(depth=noise.depth_noise(key, views.depth, disparity=self.disparity))
+            draw = functools.partial(noise.depth_noise, key, disparity=self.disparity)
+            views = views.replace(depth=draw(views.depth) if whole is None else whole(draw, views.depth))
         if self.missing >= 0:
             views = views.replace(depth=views.depth.at[:, self.missing].set(0.0))
         return views

@@ -7,6 +7,7 @@ for bit.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import pathlib
 import signal
@@ -17,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lala_jax import backbone, build, checkpoint, compiling, loop, options, pretrain_step, state, types, writers
+from lala_jax import backbone, build, checkpoint, compiling, loop, options, parallel, pretrain_step, state, types, writers
 from lala_jax.models import resnet
 from lala_jax.sim import oracle
 from lala_jax.sim.tasks import base
@@ -71,16 +72,20 @@ def trunk(recipe: pretrain_step.Recipe, params: Mapping[str, Any], frozen: Mappi
 
 def pretrain(config, workdir: str) -> pathlib.Path:
     """Run what the config's `pretrain` group describes; returns the file of weights."""
-    out, recipe = pathlib.Path(workdir), build.pretrain_recipe(config)
+    out, recipe = pathlib.Path(workdir), build.on_devices(build.pretrain_recipe(config), config, group="pretrain")
     states = draw_states(config)
     fresh, frozen = start(config, recipe, states)
-    store = checkpoint.Checkpoints(out / "checkpoints")
-    run, key = loop.start_or_resume(fresh, store, config, build.pretrain_settings), jax.random.key(config.seed)
-    writers.write_json(out / "config.json", options.to_dict(config))
+    if recipe.mesh is not None:
+        states, frozen = parallel.place((states, frozen), recipe.mesh)
+    store, key = checkpoint.Checkpoints(out / "checkpoints"), jax.random.key(config.seed)
+    run = loop.start_or_resume(fresh, store, config, build.pretrain_settings, mesh=recipe.mesh, shard=recipe.shard_state)
+    parallel.first(lambda: writers.write_json(out / "config.json", options.to_dict(config)))
     kept, all_ = (state.parameter_count(tree) for tree in (run.params["encoder"], run.params))
-    print(f"{config.task.name}: {kept:,} of {all_:,} parameters to keep, {len(states.size)} states, step {int(run.step)}", flush=True)
+    if parallel.is_first():
+        print(f"{config.task.name}: {kept:,} of {all_:,} parameters to keep, {len(states.size)} states, step {int(run.step)}", flush=True)
+    opened = writers.Writer(out) if parallel.is_first() else contextlib.nullcontext()
     stored = {"config": options.to_dict(config), "input_spec": {"encoder": recipe.model.stage}}
-    with writers.Writer(out) as writer, checkpoint.stop_signals((signal.SIGTERM, signal.SIGINT)) as stopped:
+    with opened as writer, checkpoint.stop_signals((signal.SIGTERM, signal.SIGINT)) as stopped:
         run = loop.run(
             lambda run: loop.compiled(step, recipe, run, states, frozen, key), run, total=config.pretrain.steps,
             log_every=config.train.log_every, save_every=config.train.save_every,
@@ -89,13 +94,17 @@ def pretrain(config, workdir: str) -> pathlib.Path:
         )  # fmt: skip
     if int(run.step) < config.pretrain.steps:
         raise SystemExit(f"stopped at step {int(run.step)}; the same command goes on from there")
-    backbone.save(out / "backbone.npz", *trunk(recipe, run.average, frozen))
+    average, frozen = parallel.here((run.average, frozen), recipe.mesh)
+    parallel.first(lambda: backbone.save(out / "backbone.npz", *trunk(recipe, average, frozen)))
     return out / "backbone.npz"
 
 
 def main(config, workdir) -> None:
     """Pre-train, and say where the weights are."""
-    print(f"weights for --config.camera.backbone are in {pretrain(config, build.workdir(config, workdir))}")
+    parallel.initialize()
+    file = pretrain(config, build.workdir(config, workdir))
+    if parallel.is_first():
+        print(f"weights for --config.camera.backbone are in {file}")
 
 
 if __name__ == "__main__":

@@ -28,9 +28,10 @@ BELOW = {
     **dict.fromkeys(("optim", "state"), PURE | {"optim", "state"}),
     "sim": {"types", "perception"},
     "options": set(),
+    "parallel": {"options"},
     "writers": {"types"},
     "dataset": {"types", "writers"},
-    "checkpoint": {"types", "writers"},
+    "checkpoint": {"types", "writers", "parallel"},
 }
 # Modules that no file of a part may import, whatever the depth.
 BANNED = {
