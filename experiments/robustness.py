@@ -1,19 +1,22 @@
 """One policy in changed worlds: `python -m experiments.robustness --checkpoint=runs/tower/checkpoints --split=test --episodes=100`.
 
-Each row of `ROWS` is scored with the same weights on the same seeds and compared with the first. Writes `robustness-<split>.json` to
-`--out`, experiments/results/<task> unless told, and prints a table. The file is as `common` says; each row's `drop` is the first row's
-score less its own, and `conditions` is what `lala_jax.publish --robustness` reads. Started again, it goes on with the rows that are
-missing; `--rows=moved,noise` runs only these. With `--launcher=slurm` or `local` each row is a worker's (see `lala_jax.cluster`).
+Each row of `ROWS` is scored with the same weights (in one row rounded) on the same seeds and compared with the first. Writes
+`robustness-<split>.json` to `--out`, experiments/results/<task> unless told, and prints a table. The file is as `common` says; each
+row's `drop` is the first row's score less its own, and `conditions` is what `lala_jax.publish --robustness` reads. Started again, it
+goes on with the rows that are missing; `--rows=moved,noise` runs only these. With `--launcher=slurm` or `local` each row is a worker's
+(see `lala_jax.cluster`).
 """
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from experiments import common
@@ -22,16 +25,25 @@ from lala_jax import checkpoint as checkpoints
 from lala_jax.sim import oracle
 from lala_jax.sim.tasks import base
 
+
+@dataclasses.dataclass(frozen=True)
+class World(common.Row):
+    """A row: a world, or the trained one and weights that are `stored` in another format."""
+
+    stored: str = "float32"
+
+
 MOVED = ("camera.shift=0.03", "camera.turn=3.0")
 ROWS = (
-    common.Row("nominal", "as trained"),
-    common.Row("moved", "cameras moved up to 3 cm and 3 degrees, calibrated by themselves", (*MOVED, "camera.calibrate=true")),
-    common.Row("moved-uncalibrated", "the same, not calibrated", (*MOVED, "camera.calibrate=false")),
-    common.Row("noise", "depth noise like a RealSense D415's", ("camera.depth_noise=true",)),
-    common.Row("colors", "colours never seen", ("task.colors=uniform",)),
-    common.Row("missing", "one camera of four missing, each in a quarter", parts=tuple((f"camera.missing={k}",) for k in range(4))),
-    common.Row("distractors", "two objects that the goal does not show", ("task.distractors=2",)),
-    *(common.Row(f"tower-{n}", f"towers of {n}", (f"task.num_objects={n}",), tasks=("tower",)) for n in (3, 4, 6)),
+    World("nominal", "as trained"),
+    World("moved", "cameras moved up to 3 cm and 3 degrees, calibrated by themselves", (*MOVED, "camera.calibrate=true")),
+    World("moved-uncalibrated", "the same, not calibrated", (*MOVED, "camera.calibrate=false")),
+    World("noise", "depth noise like a RealSense D415's", ("camera.depth_noise=true",)),
+    World("colors", "colours never seen", ("task.colors=uniform",)),
+    World("missing", "one camera of four missing, each in a quarter", parts=tuple((f"camera.missing={k}",) for k in range(4))),
+    World("distractors", "two objects that the goal does not show", ("task.distractors=2",)),
+    *(World(f"tower-{n}", f"towers of {n}", (f"task.num_objects={n}",), tasks=("tower",)) for n in (3, 4, 6)),
+    World("bfloat16", "as trained, weights rounded to bfloat16", stored="bfloat16"),
 )
 FLAGS = {"checkpoint": "", "split": "test", "start": 0, "episodes": 100, "rows": "", "out": "", **cluster.FLAGS}
 
@@ -60,7 +72,7 @@ def main(
     return done
 
 
-def run(row: common.Row, *, base, checkpoint: str, weights: Mapping[str, Any], seeds: Sequence[int], params: Any = None) -> dict[str, Any]:
+def run(row: World, *, base, checkpoint: str, weights: Mapping[str, Any], seeds: Sequence[int], params: Any = None) -> dict[str, Any]:
     """Score one row, each part on its share of the seeds.
 
     Without `params` reads the checkpoint, and raises CheckpointError where it no longer holds the `weights`.
@@ -69,6 +81,7 @@ def run(row: common.Row, *, base, checkpoint: str, weights: Mapping[str, Any], s
         params, found = common.load_weights(checkpoint, base)
         if found != weights:
             raise checkpoints.CheckpointError(f"{checkpoint} changed meanwhile: it holds {found}, the other rows scored {weights}")
+    params = jax.tree.map(lambda leaf: jnp.asarray(leaf, row.stored).astype(leaf.dtype), params)
     parts = zip(row.configs(base), shares(seeds, len(row.parts)), strict=False)  # fewer seeds than parts: the first parts
     return common.row_of(rollout.merged([common.score(one, params, share) for one, share in parts]))
 
