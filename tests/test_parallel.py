@@ -22,6 +22,7 @@ from test_train_step import OVERRIDES, bits
 from lala_jax import build, checkpoint, loop, options, parallel, train
 
 ROOT = pathlib.Path(__file__).parent.parent
+ROUNDING = "pick_out/bias"  # what is added to all logits of a softmax: its gradient is zero but for rounding
 ALONE = ("JAX_", "SLURM_", "OMPI_", "KUBERNETES_", "JOB_COMPLETION_INDEX", "XLA_FLAGS")
 
 
@@ -78,7 +79,8 @@ def assert_same(found, expected, *, rtol):
     for step, other in zip(metrics, reference, strict=True):
         np.testing.assert_allclose([step[name] for name in other], list(other.values()), rtol=rtol, err_msg=str(list(other)))
     for name, leaf in checkpoint.named(run).items():
-        np.testing.assert_allclose(leaves[name], leaf, rtol=rtol, atol=rtol * np.abs(leaf).max(initial=0), err_msg=name)
+        if not name.endswith(ROUNDING):
+            np.testing.assert_allclose(leaves[name], leaf, rtol=rtol, atol=rtol * np.abs(leaf).max(initial=0), err_msg=name)
 
 
 @pytest.fixture(scope="module")

@@ -152,7 +152,8 @@ def geom_template(task: base.Task) -> tuple[mjx.Model, mjx.Data]:
     robot.Arm(model).reset(data)
     mujoco.mj_forward(model, data)
     with jax.ensure_compile_time_eval():  # the cache must not keep tracers of a caller's jit
-        return mjx.put_model(model), mjx.put_data(model, data)
+        here = jax.local_devices()[0]  # MJX's own choice is the first device of all processes
+        return mjx.put_model(model, device=here), mjx.put_data(model, data, device=here)
 
 
 def place(
