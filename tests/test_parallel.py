@@ -164,6 +164,11 @@ SMALL = ("model.name=graph", "model.width=8", "camera.calibrate=false", "data.de
 SMALL += ("train.save_every=1", "train.eval_every=9", "train.eval_episodes=1", "eval.episodes=1", "eval.parallel=1", "eval.strips=1")
 
 
+def said_by_us(out):
+    """What a process printed, less what JAX's transport says when it connects."""
+    return "".join(line for line in out.splitlines(keepends=True) if not line.startswith("[Gloo]"))
+
+
 def rows(workdir):
     """The curve's losses by step."""
     lines = [json.loads(line) for line in (workdir / "metrics.jsonl").read_text().splitlines()]
@@ -182,7 +187,7 @@ def test_two_processes_are_one_run(start_pair, tmp_path):
     ((out, err), (silence, _)), status = finish(pair)
     stopped = max(rows(workdir))
     assert stopped < 4 and status == [1, 1], err
-    assert f"stopped at step {stopped}" in err and "step 1 of 4" in out and not silence
+    assert f"stopped at step {stopped}" in err and "step 1 of 4" in out and said_by_us(silence) == ""
     assert int(checkpoint.load(workdir / "checkpoints", which="latest")[0]["step"]) == stopped
 
     config = options.load("configs/tower.py:smoke", changes)
@@ -197,7 +202,7 @@ def test_two_processes_are_one_run(start_pair, tmp_path):
 
     ((out, err), (silence, _)), status = finish(start_pair("-m", "lala_jax.train", *arguments))
     assert status == [0, 0], err
-    assert "val split, 1 episodes: score" in out and not silence
+    assert "val split, 1 episodes: score" in out and said_by_us(silence) == ""
     np.testing.assert_allclose([rows(workdir)[number] for number in losses], list(losses.values()), rtol=1e-4)
     np.testing.assert_allclose([late[number] for number in late], [losses[number] for number in late], rtol=1e-4)
     lines = (workdir / "metrics.jsonl").read_text().splitlines()
