@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 
 import jax
@@ -36,14 +37,29 @@ def sensors(key: jax.Array, key_noise: jax.Array, views: types.Views, errors: Se
     key_move, key_missing, key_which, key_coin = jax.random.split(key, 4)
     depth = views.depth
     if errors.depth_noise:
-        noisy = noise.depth_noise(key_noise, depth, disparity=disparity)
-        depth = jnp.where(jax.random.bernoulli(key_coin, errors.depth_noise), noisy, depth)
+        disturb = functools.partial(noise.depth_noise, key_noise, depth, disparity=disparity)
+        depth = jax.lax.cond(jax.random.bernoulli(key_coin, errors.depth_noise), disturb, lambda: depth)
     if errors.missing:
         which = jax.random.randint(key_which, (), 0, depth.shape[0])
         lost = (jnp.arange(depth.shape[0]) == which) & jax.random.bernoulli(key_missing, errors.missing)
         depth = jnp.where(lost[:, None, None], 0.0, depth)
     believed = noise.move_cameras(key_move, views.camera, shift=errors.shift, turn=math.radians(errors.turn))
     return views.replace(depth=depth, camera=believed)
+
+
+def sensors_batch(key: jax.Array, key_noise: jax.Array, views: types.Views, errors: Sensors, *, disparity: float) -> types.Views:
+    """Let the cameras of B scenes (leaves `[B, V, ...]`, keys `[B]`) err, as `sensors` says.
+
+    One scene after the other on a CPU, where noise that is not wanted is then not drawn; all at once elsewhere.
+    """
+
+    def one(scene):
+        key, key_noise, views = scene
+        return sensors(key, key_noise, views, errors, disparity=disparity)
+
+    scenes = (key, key_noise, views.replace(rgb=None))  # which would be copied for nothing
+    erring = jax.lax.map(one, scenes) if jax.default_backend() == "cpu" else jax.vmap(one)(scenes)
+    return erring.replace(rgb=views.rgb)
 
 
 def recolor(

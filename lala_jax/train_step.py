@@ -69,11 +69,8 @@ def _observe(recipe, key_look, keys, examples, whole=None):
     observer, (key_errors, *key_noise) = recipe.observer, keys
     views = observer.look(facts, color, stand, poses, key=key_look, whole=whole)
     if recipe.sensors:
-
-        def err(key, key_noise, one):
-            return augment.sensors(key, key_noise, one, recipe.sensors, disparity=observer.disparity)
-
-        views = jax.vmap(err)(jnp.concatenate([key_errors, key_errors]), jnp.concatenate(key_noise), views)
+        pair = jnp.concatenate([key_errors, key_errors])
+        views = augment.sensors_batch(pair, jnp.concatenate(key_noise), views, recipe.sensors, disparity=observer.disparity)
     maps = observer.fuse(views)
     return jax.tree.map(lambda x: x[:size], maps), jax.tree.map(lambda x: x[size:], maps)
 

@@ -134,6 +134,22 @@ def erring(**errors):
     return jax.jit(jax.vmap(lambda key, key_noise: see(key, key_noise, some_views())))(*KEYS)
 
 
+def test_scenes_err_in_a_batch_as_alone():
+    """Bit for bit where there is noise and where there is none: one after the other or all at once."""
+    errors = {"depth_noise": 0.5, "shift": 0.01, "turn": 1.0, "missing": 0.5}
+    few = [keys[:12] for keys in KEYS]
+    views = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (12, *leaf.shape)), some_views())
+    batch = jax.jit(lambda *keys: augment.sensors_batch(*keys, views, augment.Sensors(**errors), disparity=12.0))(*few)
+    see = jax.jit(lambda *keys: augment.sensors(*keys, some_views(), augment.Sensors(**errors), disparity=12.0))
+    alone = [see(*keys) for keys in zip(*few, strict=True)]
+    jax.tree.map(lambda found, *one: np.testing.assert_array_equal(found, np.stack(one)), batch, *alone)
+    every = erring(**errors)
+    np.testing.assert_allclose(batch.camera.world_from_cam, every.camera.world_from_cam[:12], atol=1e-6)
+    assert ((batch.depth == 0) == (every.depth[:12] == 0)).mean() > 0.999 and np.isclose(
+        batch.depth, every.depth[:12], atol=1e-6
+    ).mean() > 0.99
+
+
 def test_sensors_without_errors_change_nothing():
     assert not augment.Sensors() and augment.Sensors(missing=0.1) and augment.Sensors(turn=0.1)
     same = augment.sensors(KEYS[0][0], KEYS[1][0], some_views(), augment.Sensors(), disparity=12.0)
