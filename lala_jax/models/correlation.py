@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import jax.numpy as jnp
 
@@ -43,19 +45,79 @@ def _correlate_conv(key: jax.Array, kernels: jax.Array) -> jax.Array:
 
 
 def _correlate_fft(key: jax.Array, kernels: jax.Array) -> jax.Array:
-    """Correlate in the spectrum, the channels summed before the inverse so that there is one inverse a kernel.
+    """Correlate in the spectrum, the channels summed before the inverse so that there is one inverse a kernel."""
+    key, kernels = jnp.moveaxis(key.astype(jnp.float32), -1, 0), jnp.moveaxis(kernels.astype(jnp.float32), -1, 1)
+    return _spectral(key, kernels, _CHUNK if jax.default_backend() == "cpu" else len(kernels))
 
-    The map is shifted by the kernel's reach, which puts the answer at the origin; the longer reach, not the whole
-    kernel, is all the zeros needed against wrapping around.
+
+# A CPU takes a few kernels at a time, whose spectra then stay in its caches: faster than all at once by a third to a half.
+_CHUNK = 2
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
+def _spectral(key: jax.Array, kernels: jax.Array, chunk: int) -> jax.Array:
+    """Correlate `[d, rows, cols]` with `[k, d, c, c]`, `chunk` kernels at a time.
+
+    The derivative is written out, since it too needs one inverse a kernel only, and no spectrum of a kernel is kept for it.
     """
-    rows, cols, _ = key.shape
-    before, after = _reach(kernels.shape[1])
-    height, width = _fast_length(rows + max(before, after)), _fast_length(cols + max(before, after))
-    key = jnp.moveaxis(key.astype(jnp.float32), -1, 0)
-    key = jnp.pad(key, ((0, 0), (before, height - before - rows), (before, width - before - cols)))
-    kernels = jnp.moveaxis(kernels.astype(jnp.float32), -1, 1)
-    spectrum = (jnp.fft.rfft2(key)[None] * jnp.conj(_rfft2(kernels, height, width))).sum(1)
-    return jnp.fft.irfft2(spectrum, s=(height, width))[:, :rows, :cols]
+    rows, cols = key.shape[1:]
+    spectrum, (height, width), _ = _key_spectrum(key, kernels.shape[-1])
+
+    def some(part):
+        return _irfft2((spectrum * jnp.conj(_rfft2(part, height, width))).sum(1), width, rows, cols)
+
+    return _joined(jax.lax.map(some, _chunks(kernels, chunk)), len(kernels))
+
+
+def _spectral_fwd(key, kernels, chunk):
+    return _spectral(key, kernels, chunk), (key, kernels)
+
+
+def _spectral_bwd(chunk, kept, slopes):
+    key, kernels = kept
+    rows, cols, size = *key.shape[1:], kernels.shape[-1]
+    spectrum, (height, width), before = _key_spectrum(key, size)
+
+    def some(total, part):
+        kernel, slope = (_rfft2(one, height, width) for one in part)
+        slope = slope[:, None]
+        return total + (slope * kernel).sum(0), _irfft2(spectrum * jnp.conj(slope), width, size, size)
+
+    parts = _chunks(kernels, chunk), _chunks(slopes, chunk)
+    total, by_kernel = jax.lax.scan(some, jnp.zeros_like(spectrum), parts)
+    by_key = jnp.fft.irfft2(total, s=(height, width))[:, before : before + rows, before : before + cols]
+    return by_key, _joined(by_kernel, len(kernels))
+
+
+_spectral.defvjp(_spectral_fwd, _spectral_bwd)
+
+
+def _key_spectrum(key, size):
+    """Transform the map `[d, rows, cols]`: its spectrum, the lengths of the transform, and where the map begins in what is transformed.
+
+    The map is shifted by the kernel's reach, which puts the answer at the origin; the longer reach, not the whole kernel, is all the
+    zeros needed against wrapping around.
+    """
+    before, after = _reach(size)
+    lengths = tuple(_fast_length(side + max(before, after)) for side in key.shape[1:])
+    rims = ((before, length - before - side) for side, length in zip(key.shape[1:], lengths, strict=True))
+    return jnp.fft.rfft2(jnp.pad(key, ((0, 0), *rims))), lengths, before
+
+
+def _chunks(values, chunk):
+    """Split `[k, ...]` into `[n, chunk, ...]`, zeros added where it does not come out even."""
+    chunk = min(chunk, len(values))
+    more = -len(values) % chunk
+    return jnp.pad(values, ((0, more), *[(0, 0)] * (values.ndim - 1))).reshape(-1, chunk, *values.shape[1:])
+
+
+def _joined(parts, count):
+    return parts.reshape(-1, *parts.shape[2:])[:count]
+
+
+def _irfft2(spectrum: jax.Array, width: int, rows: int, cols: int) -> jax.Array:
+    """Give the first `rows` and `cols` of the inverse transform, without transforming the other rows back."""
+    return jnp.fft.irfft(jnp.fft.ifft(spectrum, axis=-2)[..., :rows, :], n=width, axis=-1)[..., :cols]
 
 
 def _rfft2(kernels: jax.Array, height: int, width: int) -> jax.Array:

@@ -86,6 +86,25 @@ def test_gradients_are_those_of_a_bilinear_form(method):
     np.testing.assert_allclose(of_kernels.ravel(), want_kernels, atol=2e-5)
 
 
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.bfloat16])
+@pytest.mark.parametrize("chunk", [1, 2, 4, 9])
+def test_kernels_some_at_a_time_have_the_values_and_gradients_of_a_convolution(monkeypatch, chunk, dtype):
+    """Also where their number does not come out even, and in a batch."""
+    monkeypatch.setattr(correlation, "_CHUNK", chunk)
+    batch = [jnp.stack(leaf).astype(dtype) for leaf in zip(*[_inputs(seed, k=5, size=4) for seed in range(2)], strict=True)]
+    weight = np.random.default_rng(6).normal(size=(2, 5, 9, 6)).astype(np.float32)
+
+    def form(key, kernels, method):
+        out = jax.vmap(lambda *one: correlation.correlate(*one, method=method))(key, kernels)
+        return (weight * out).sum(), out
+
+    found, want = (jax.jit(jax.grad(form, (0, 1), has_aux=True), static_argnums=2)(*batch, method) for method in BOTH)
+    assert jax.tree.map(lambda leaf: leaf.dtype, found[0]) == (dtype, dtype)
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(want), strict=True):
+        one, other = (np.asarray(leaf, np.float32) for leaf in (one, other))
+        np.testing.assert_allclose(one, other, atol=(1e-5 if dtype == jnp.float32 else 0.02) * np.abs(other).max())
+
+
 @pytest.mark.parametrize("method", BOTH)
 def test_bfloat16_goes_in_and_float32_comes_out(method):
     key, kernels = (x.astype(jnp.bfloat16) for x in map(jnp.asarray, _inputs(4)))
