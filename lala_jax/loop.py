@@ -69,13 +69,10 @@ def start_or_resume(
 
 def compiled(jitted, recipe: Any, current: state.TrainState, *inputs: Any) -> Step:
     """Compile `jitted(recipe, state, *inputs)`, whose recipe is static, say what a step needs, and give it as a function of the state."""
-    told = parallel.is_first()
-    if told:
-        print("compiling the training step", flush=True)
+    parallel.say("compiling the training step")
     program, facts = compiling.build(jitted, recipe, current, *inputs)
     memory = f"{facts['memory'] / 2**20:,.0f} MiB" if "memory" in facts else "an unknown amount"
-    if told:
-        print(f"compiled in {facts['compile_seconds']:.0f} s; a step needs {memory} of memory", flush=True)
+    parallel.say(f"compiled in {facts['compile_seconds']:.0f} s; a step needs {memory} of memory")
     return lambda current: program(current, *inputs)
 
 

@@ -82,6 +82,12 @@ def is_first() -> bool:
     return jax.process_index() == 0
 
 
+def say(text: str) -> None:
+    """Print a line, in the first process only."""
+    if is_first():
+        print(text, flush=True)
+
+
 def _client():
     """Give JAX's own store of keys and values, which has no public name; there is one where there are several processes."""
     from jax._src import distributed

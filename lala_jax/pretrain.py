@@ -81,8 +81,7 @@ def pretrain(config, workdir: str) -> pathlib.Path:
     run = loop.start_or_resume(fresh, store, config, build.pretrain_settings, mesh=recipe.mesh, shard=recipe.shard_state)
     parallel.first(lambda: writers.write_json(out / "config.json", options.to_dict(config)))
     kept, all_ = (state.parameter_count(tree) for tree in (run.params["encoder"], run.params))
-    if parallel.is_first():
-        print(f"{config.task.name}: {kept:,} of {all_:,} parameters to keep, {len(states.size)} states, step {int(run.step)}", flush=True)
+    parallel.say(f"{config.task.name}: {kept:,} of {all_:,} parameters to keep, {len(states.size)} states, step {int(run.step)}")
     opened = writers.Writer(out) if parallel.is_first() else contextlib.nullcontext()
     stored = {"config": options.to_dict(config), "input_spec": {"encoder": recipe.model.stage}}
     with opened as writer, checkpoint.stop_signals((signal.SIGTERM, signal.SIGINT)) as stopped:
@@ -102,9 +101,7 @@ def pretrain(config, workdir: str) -> pathlib.Path:
 def main(config, workdir) -> None:
     """Pre-train, and say where the weights are."""
     parallel.initialize()
-    file = pretrain(config, build.workdir(config, workdir))
-    if parallel.is_first():
-        print(f"weights for --config.camera.backbone are in {file}")
+    parallel.say(f"weights for --config.camera.backbone are in {pretrain(config, build.workdir(config, workdir))}")
 
 
 if __name__ == "__main__":

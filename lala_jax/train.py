@@ -45,9 +45,8 @@ def train_and_evaluate(config, workdir: str) -> dict[str, Any]:
     run = start_or_resume(config, recipe, store)
     parallel.first(lambda: writers.write_json(out / "config.json", options.to_dict(config)))
     count = state.parameter_count(run.params)
-    if parallel.is_first():
-        shared = "" if recipe.mesh is None else f", {recipe.mesh.size} devices"
-        print(f"{config.task.name}: {count:,} parameters, {states.size.shape[0]} states, step {int(run.step)}{shared}", flush=True)
+    shared = "" if recipe.mesh is None else f", {recipe.mesh.size} devices"
+    parallel.say(f"{config.task.name}: {count:,} parameters, {states.size.shape[0]} states, step {int(run.step)}{shared}")
     stored = {"config": options.to_dict(config), "input_spec": build.input_spec(config)}
     opened = writers.Writer(out) if parallel.is_first() else contextlib.nullcontext()
     with opened as writer, checkpoint.stop_signals((signal.SIGTERM, signal.SIGINT)) as stopped:

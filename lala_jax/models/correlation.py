@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 METHODS = ("auto", "fft", "conv")
 
-# The one place where the platform decides; anything not named here convolves. In the spectrum the cost hardly grows with
+# What the platform decides, here and with _CHUNK; anything not named here convolves. In the spectrum the cost hardly grows with
 # the crop, where a direct convolution pays for every pixel of it and its gradient is a convolution with a map-sized kernel.
 _METHOD_OF_PLATFORM = {"cpu": "fft", "gpu": "fft"}
 
