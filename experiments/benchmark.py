@@ -52,7 +52,7 @@ def main(config, workdir, *, task: str, stages: str, growth: bool, repeats: int,
     for row in rows:
         row["share"] = {field: row[f"{field}_per_second"] / peak for field, peak in peaks.items() if f"{field}_per_second" in row}
     grown = [benchmark_stages.grow(name, config, repeats) for name in benchmark_stages.GROWTH] if growth else []
-    targets = [benchmark_targets.judged(target, rows, task) for target in benchmark_targets.TARGETS]
+    targets = [benchmark_targets.judged(target, rows, task, jax.default_backend()) for target in benchmark_targets.TARGETS]
     result = {"task": task, **machine(), "stages": rows, "growth": grown, "targets": targets}
     kind = "".join(letter if letter.isalnum() else "-" for letter in result["device"].lower())
     path = pathlib.Path(out) / f"{kind}-{task}.json"

@@ -35,6 +35,13 @@ def matrix_product(config) -> timing.Work:
     return timing.compiled(jnp.matmul, x, x)
 
 
+def matrix_product_bfloat16(config) -> timing.Work:
+    """Multiply two matrices of 8192 x 8192 in bfloat16."""
+    del config
+    x = jax.random.normal(jax.random.key(0), (8192, 8192), jnp.bfloat16)
+    return timing.compiled(jnp.matmul, x, x)
+
+
 def copy(config) -> timing.Work:
     """Read and write 256 MB."""
     del config
@@ -103,15 +110,15 @@ def fuse(config) -> timing.Work:
     return timing.compiled(observer.fuse, views, count=BATCH)
 
 
-def observe(config) -> timing.Work:
+def observe(config, *, count: int = BATCH) -> timing.Work:
     """Render, unproject and fuse."""
-    observer, (drawn, poses) = build.observer(config), scenes_of(config, BATCH)
+    observer, (drawn, poses) = build.observer(config), scenes_of(config, count)
     observer.background()
 
     def maps(size, color, base, poses):
         return topdown.from_views_batch(jax.vmap(observer.views)(size, color, base, poses), spec=observer.spec)
 
-    return timing.compiled(maps, drawn.size, drawn.color, drawn.base, poses, count=BATCH)
+    return timing.compiled(maps, drawn.size, drawn.color, drawn.base, poses, count=count)
 
 
 def features(config) -> timing.Work:
@@ -165,9 +172,9 @@ def training_step(config) -> timing.Work:
     return timing.stepping(step, fresh, states, key, recipe.policy.frozen, count=recipe.batch_size)
 
 
-def paper_step(config) -> timing.Work:
+def paper_step(config, **fields) -> timing.Work:
     """Take a step of the paper's two-stream agent at its own size."""
-    return training_step(options.load(f"configs/{config.task.name}.py:paper"))
+    return training_step(resized(options.load(f"configs/{config.task.name}.py:paper"), **fields))
 
 
 def paper_example(rows: int, cols: int) -> dict[str, Any]:
@@ -193,20 +200,26 @@ def drawn_leaf(rng: np.random.Generator, leaf: jax.ShapeDtypeStruct) -> jax.Arra
     return jnp.asarray(rng.normal(size=leaf.shape) * np.prod(leaf.shape[:-1]) ** -0.5, jnp.float32)
 
 
-def paper_network(config, *, rows: int = 320, cols: int = 160, **sizes) -> timing.Work:
-    """Take plain steps of the paper's two-stream network on given maps, one example at a time: loss, gradient, Adam."""
+def paper_network(config, *, rows: int = 320, cols: int = 160, batch: int = 1, **sizes) -> timing.Work:
+    """Take plain steps of the paper's two-stream network on given maps, `batch` examples at a time: loss, gradient, Adam."""
     del config
     net, optimizer, example = transporter.Transporter(**sizes), optax.adam(1e-4), jax.tree.map(jnp.asarray, paper_example(rows, cols))
 
-    def step(run, example):
+    def step(run, examples):
         params, moments = run
-        grads, logits = jax.grad(lambda params: paper_losses(net, params, example), has_aux=True)(params)
+
+        def mean_loss(params):
+            found, logits = jax.vmap(functools.partial(paper_losses, net, params))(examples)
+            return found.mean(), logits
+
+        grads, logits = jax.grad(mean_loss, has_aux=True)(params)
         updates, moments = optimizer.update(grads, moments)
         return (optax.apply_updates(params, updates), moments), {name: leaf.max() for name, leaf in logits.items()}
 
     shapes = jax.eval_shape(lambda key: net.init(key, example["current"], example["goal"], example["pick"])["params"], jax.random.key(0))
     params = jax.tree.map(functools.partial(drawn_leaf, np.random.default_rng(0)), shapes)
-    return timing.stepping(compiling.jit(step, donate_argnums=0), (params, optimizer.init(params)), example)
+    examples = jax.tree.map(lambda leaf: jnp.stack([leaf] * batch), example)
+    return timing.stepping(compiling.jit(step, donate_argnums=0), (params, optimizer.init(params)), examples, count=batch)
 
 
 def correlate_torch(config, **sizes) -> timing.Work:
@@ -322,8 +335,10 @@ def first_step(config, *, cached: bool) -> timing.Work:
 
 
 CEILINGS = {"matmul": "flops", "copy": "bytes"}
+LARGE = {"model.dtype": "bfloat16", "train.batch_size": 8}  # how a GPU takes the paper's step
 STAGES = {
     "matmul": timing.Stage("matrix product 2048 x 2048", "product", matrix_product),
+    "matmul-bfloat16": timing.Stage("matrix product 8192 x 8192, bfloat16", "product", matrix_product_bfloat16, platform="gpu"),
     "copy": timing.Stage("reading and writing 256 MB", "copy", copy),
     "import": timing.Stage("starting Python and importing lala_jax", "start", start_up),
     "first-step": timing.Stage("from starting Python to the first training step", "start", functools.partial(first_step, cached=False)),
@@ -334,6 +349,7 @@ STAGES = {
     ),
     "fuse": timing.Stage("unproject and fuse them", "observation", lambda config: fuse(full_size(config))),
     "observe": timing.Stage("render, unproject and fuse", "observation", lambda config: observe(full_size(config))),
+    "observe-many": timing.Stage("the same, batch 64", "observation", lambda config: observe(full_size(config), count=64), platform="gpu"),
     "observe-compact": timing.Stage("the same at the config's resolution", "observation", observe),
     "backbone": timing.Stage("fuse with ResNet-50 features", "observation", features),
     "act": timing.Stage("act", "action", act),
@@ -342,8 +358,18 @@ STAGES = {
     "correlate-torch": timing.Stage("the same with PyTorch's conv2d", "sample", correlate_torch, alone=True, needs=("torch",)),
     "inputs": timing.Stage("examples of a training step", "sample", input_pipeline),
     "train": timing.Stage("training step", "sample", training_step),
+    "train-many": timing.Stage(
+        "training step, batch 64", "sample", lambda config: training_step(resized(config, **{"train.batch_size": 64})), platform="gpu"
+    ),
     "train-paper": timing.Stage("training step, paper's size", "sample", paper_step),
+    "train-paper-bfloat16": timing.Stage("the same in bfloat16, batch 8", "sample", functools.partial(paper_step, **LARGE), platform="gpu"),
+    "train-paper-plain": timing.Stage(
+        "the same without a backbone", "sample", functools.partial(paper_step, **LARGE, **{"camera.backbone": ""}), platform="gpu"
+    ),
     "train-paper-network": timing.Stage("the same on given maps without a backbone", "sample", paper_network, alone=True),
+    "train-paper-network-bfloat16": timing.Stage(
+        "that in bfloat16, batch 8", "sample", functools.partial(paper_network, batch=8, dtype=jnp.bfloat16), platform="gpu"
+    ),
     "train-paper-torch": timing.Stage("that with PyTorch", "sample", paper_torch, alone=True, needs=("torch",)),
     "primitive": timing.Stage("one action of the arm", "action", primitive),
     "collect": timing.Stage("demonstrations", "demonstration", collection),

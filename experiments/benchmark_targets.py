@@ -1,4 +1,4 @@
-"""What the benchmark must show: times of two cores, and ratios of two stages of one run."""
+"""What the benchmark must show: times of two cores or of a large GPU, and ratios of two stages of one run."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ class Target:
     compute: Callable[..., float]
     at_least: bool = False
     task: str = ""  # the only one that it is about
+    platform: str = ""  # the only one of JAX's that it is about
 
 
 def seconds(row: Row) -> float:
@@ -36,6 +37,14 @@ def hundred(row: Row) -> float:
     return 100 * row["seconds"]
 
 
+def training(row: Row) -> float:
+    return 20_000 * row["seconds"]
+
+
+def rates(row: Row, other: Row) -> float:
+    return ratio(row, other, field="flops_per_second")
+
+
 def peaks(row: Row, other: Row) -> float:
     return ratio(row, other, field="process_memory")
 
@@ -45,28 +54,75 @@ def again(*rows: Row) -> float:
 
 
 TARGETS = (
-    Target("mujoco.Renderer's time over ours, 4 views of 640 x 480", 10, "times", ("render-mujoco", "render"), ratio, at_least=True),
-    Target("render, unproject and fuse an observation, batch 8", 0.025, "s", ("observe",), seconds),
-    Target("conv2d of PyTorch, time over our correlation's", 20, "times", ("correlate-torch", "correlate"), ratio, at_least=True),
-    Target("direct convolution of JAX, likewise", 20, "times", ("correlate-direct", "correlate"), ratio, at_least=True),
-    Target("paper's step in PyTorch, time over ours", 6, "times", ("train-paper-torch", "train-paper-network"), ratio, at_least=True),
-    Target("paper's step in PyTorch, memory over ours", 1, "times", ("train-paper-torch", "train-paper-network"), peaks, at_least=True),
+    Target(
+        "mujoco.Renderer's time over ours, 4 views of 640 x 480",
+        10,
+        "times",
+        ("render-mujoco", "render"),
+        ratio,
+        at_least=True,
+        platform="cpu",
+    ),
+    Target("render, unproject and fuse an observation, batch 8", 0.025, "s", ("observe",), seconds, platform="cpu"),
+    Target(
+        "conv2d of PyTorch, time over our correlation's",
+        20,
+        "times",
+        ("correlate-torch", "correlate"),
+        ratio,
+        at_least=True,
+        platform="cpu",
+    ),
+    Target("direct convolution of JAX, likewise", 20, "times", ("correlate-direct", "correlate"), ratio, at_least=True, platform="cpu"),
+    Target(
+        "paper's step in PyTorch, time over ours",
+        6,
+        "times",
+        ("train-paper-torch", "train-paper-network"),
+        ratio,
+        at_least=True,
+        platform="cpu",
+    ),
+    Target(
+        "paper's step in PyTorch, memory over ours",
+        1,
+        "times",
+        ("train-paper-torch", "train-paper-network"),
+        peaks,
+        at_least=True,
+        platform="cpu",
+    ),
+    Target("paper's step in bfloat16, a sample", 0.01, "s", ("train-paper-bfloat16",), seconds, platform="gpu"),
+    Target("20,000 samples of it", 240, "s", ("train-paper-bfloat16",), training, platform="gpu"),
+    Target(
+        "its network's rate over a matrix product's",
+        0.35,
+        "%",
+        ("train-paper-network-bfloat16", "matmul-bfloat16"),
+        rates,
+        at_least=True,
+        platform="gpu",
+    ),
+    Target("training step, a sample, batch 64", 0.001, "s", ("train-many",), seconds, platform="gpu"),
+    Target("render, unproject and fuse an observation, batch 64", 0.0005, "s", ("observe-many",), seconds, platform="gpu"),
     Target("a demonstration of a tower", 0.5, "s", ("collect",), seconds, task="tower"),
     Target("closed loop of 100 episodes", 180, "s", ("evaluate",), hundred),
-    Target("input pipeline's share of the training step", 0.15, "%", ("inputs", "train"), ratio),
+    Target("input pipeline's share of the training step", 0.15, "%", ("inputs", "train"), ratio, platform="cpu"),
     Target("programs compiled again after a first run", 0, "", (), again),
     Target("starting Python and importing lala_jax", 0.3, "s", ("import",), seconds),
-    Target("first training step from a cold start", 60, "s", ("first-step",), seconds),
-    Target("first training step with kept programs", 15, "s", ("first-step-cached",), seconds),
+    Target("first training step from a cold start", 60, "s", ("first-step",), seconds, platform="cpu"),
+    Target("first training step with kept programs", 15, "s", ("first-step-cached",), seconds, platform="cpu"),
 )
 
 
-def judged(target: Target, rows: Sequence[Row], task: str) -> dict[str, Any]:
+def judged(target: Target, rows: Sequence[Row], task: str, platform: str) -> dict[str, Any]:
     """Say what was measured and whether the target is met, or `unavailable`: why that cannot be said."""
     found = {"label": target.label, "bound": target.bound, "unit": target.unit, "at_least": target.at_least}
     by_name = {row["name"]: row for row in rows}
     if target.task not in ("", task):
         return {**found, "unavailable": f"measured with --task={target.task}"}
+    if target.platform not in ("", platform):
+        return {**found, "unavailable": f"about a {target.platform.upper()}"}
     for name in target.stages:
         if name not in by_name:
             return {**found, "unavailable": f"{name} was not timed"}

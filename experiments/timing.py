@@ -50,6 +50,7 @@ class Stage:
     alone: bool = False  # in a process of its own, which may be slow or run out of memory
     needs: tuple[str, ...] = ()  # modules that such a process imports first
     environment: Mapping[str, str] = dataclasses.field(default_factory=dict)  # of such a process, where the user's does not say
+    platform: str = ""  # the only one of JAX's that it is for
 
 
 def compiled(function: Callable[..., Any], *arguments: Any, count: int = 1) -> Work:
@@ -105,6 +106,8 @@ def timed(name: str, stages: Mapping[str, Stage], config, repeats: int) -> dict[
     stage = stages[name]
     row = {"name": name, "label": stage.label, "unit": stage.unit}
     try:
+        if stage.platform not in ("", jax.default_backend()):
+            raise Unavailable(f"needs a {stage.platform.upper()}")
         if stage.alone:
             return row | alone(name, stage, config, repeats)
         return row | measured(stage.prepare(config), repeats) | device_memory()

@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
+import jax.numpy as jnp
 import numpy as np
 
 from lala_jax import (
@@ -29,9 +30,10 @@ from lala_jax.sim import scene, tasks
 from lala_jax.sim.tasks import base
 
 MODELS = ("goal_aware", *transporter.VARIANTS, "cliport", "graph")
+DTYPES = ("float32", "bfloat16")  # of model.dtype
 CLIP_STAGES = (2, 3, 4)  # of CLIP's trunk, that cliport may take
 # What configs in checkpoints that are older than a field mean.
-NEWER = {"augment.mix": 0.5, "model.clip": "", "model.clip_tokenizer": "", "model.clip_stages": 0}
+NEWER = {"augment.mix": 0.5, "model.clip": "", "model.clip_tokenizer": "", "model.clip_stages": 0, "model.dtype": "float32"}
 SPLITS = ("train", "val", "test")
 TEST_START = 10_001
 WORKDIR = "runs/<task>"  # the default of --workdir
@@ -113,6 +115,9 @@ def build_policy(config: Mapping[str, Any]) -> policy.Policy:
     if surface(config) and fields["name"] not in transporter.VARIANTS:
         known = ", ".join(transporter.VARIANTS)
         raise options.OptionsError(f"model.name {fields['name']!r} takes no camera.backbone; those that do are {known}")
+    dtype = options.check_choice("model.dtype", fields.get("dtype", NEWER["model.dtype"]), DTYPES)
+    if dtype != "float32" and fields["name"] in ("goal_aware", "graph"):
+        raise options.OptionsError(f"model.name {fields['name']!r} computes in float32 only, got model.dtype={dtype!r}")
     if fields["name"] == "goal_aware":
         if spec.rows % 4 or spec.cols % 4 or fields["crop"] % 4:
             sizes = f"{spec.rows}, {spec.cols} and {fields['crop']}"
@@ -125,7 +130,7 @@ def build_policy(config: Mapping[str, Any]) -> policy.Policy:
         return policy.GoalAwarePolicy(model=model, **choices)
     if fields["name"] == "graph":
         return policy.GraphPolicy(model=graph.Graph(width=fields["width"]), spec=spec, multi_action=fields["multi_action"])
-    shared |= {"yaw_bins": fields["rotations"], "width": fields["width"], "stages": fields["stages"]}
+    shared |= {"yaw_bins": fields["rotations"], "width": fields["width"], "stages": fields["stages"], "dtype": jnp.dtype(dtype)}
     choices = {name: fields[name] for name in ("multi_action", "max_height")}
     try:
         if fields["name"] == "cliport":

@@ -267,10 +267,10 @@ def test_a_wrong_request_ends_with_one_message(arguments, message, capsys):
     assert message.split(".*")[0] in text and message.split(".*")[-1] in text
 
 
-def judge(name, rows, task="tower"):
+def judge(name, rows, task="tower", platform="cpu"):
     """Judge the one target whose first stage is `name`, and give its line of the table, too."""
-    (target,) = [target for target in benchmark_targets.TARGETS if target.stages[:1] == (name,)]
-    found = benchmark_targets.judged(target, rows, task)
+    target = next(target for target in benchmark_targets.TARGETS if target.stages[:1] == (name,))
+    found = benchmark_targets.judged(target, rows, task, platform)
     return found, benchmark_targets.table([found]).splitlines()[-1]
 
 
@@ -290,7 +290,8 @@ def test_targets_are_met_or_missed_and_nothing_is_hidden():
     assert judge("collect", rows_of(collect=0.4))[0]["met"] and not judge("collect", rows_of(collect=0.6))[0]["met"]
     again = [*rows_of(render=1.0), {"name": "act", "seconds": 1.0, "recompiled": 2}, {"name": "save", "unavailable": "why"}]
     (target,) = [target for target in benchmark_targets.TARGETS if not target.stages]
-    assert benchmark_targets.judged(target, again, "tower")["value"] == 2 and not benchmark_targets.judged(target, again, "tower")["met"]
+    found = benchmark_targets.judged(target, again, "tower", "cpu")
+    assert found["value"] == 2 and not found["met"]
 
 
 def test_a_target_that_cannot_be_judged_says_why():
@@ -299,8 +300,23 @@ def test_a_target_that_cannot_be_judged_says_why():
     assert judge("observe", [])[0]["unavailable"] == "observe was not timed"
     assert judge("collect", rows_of(collect=0.1), "pallet")[0]["unavailable"] == "measured with --task=tower"
     paper = rows_of(train_paper_torch=8.0, train_paper_network=1.0)
-    speed, size = (benchmark_targets.judged(t, paper, "tower") for t in benchmark_targets.TARGETS if "train-paper-torch" in t.stages)
+    both = [target for target in benchmark_targets.TARGETS if "train-paper-torch" in target.stages]
+    speed, size = (benchmark_targets.judged(target, paper, "tower", "cpu") for target in both)
     assert speed["met"] and size["unavailable"] == "this machine does not tell 'process_memory'" and "met" not in size
+
+
+def test_some_targets_are_about_one_kind_of_machine():
+    rows = rows_of(train_paper_bfloat16=0.009)
+    assert judge("train-paper-bfloat16", rows, platform="gpu")[1].endswith("| 9 ms | at most 10 ms | yes |")
+    assert judge("train-paper-bfloat16", rows)[1].endswith("| about a GPU | at most 10 ms | unknown |")
+    assert judge("render-mujoco", [], platform="gpu")[0]["unavailable"] == "about a CPU"
+    fast = [{"name": name, "flops_per_second": value} for name, value in (("train-paper-network-bfloat16", 3.0), ("matmul-bfloat16", 10.0))]
+    assert judge("train-paper-network-bfloat16", fast, platform="gpu")[1].endswith("| 30.0% | at least 35.0% | MISSED |")
+
+
+def test_a_stage_for_another_kind_of_machine_is_left_out():
+    stages = {"a": timing.Stage("a", "thing", pytest.fail, platform="tpu")}
+    assert timing.timed("a", stages, None, 1)["unavailable"] == "needs a TPU"
 
 
 def test_targets_name_stages_that_there_are():

@@ -49,3 +49,44 @@ def test_donated_memory_is_counted_once_and_static_arguments_are_left_out():
     program, facts = compiling.build(jitted, 3, x)
     assert x.nbytes <= facts["memory"] < 1.5 * x.nbytes and facts["compile_seconds"] > 0
     assert float(program(x)[0]) == 3.0 and x.is_deleted()
+
+
+def _conv(strides, padding, rhs_dilation=(1, 1)):
+    def run(image, kernel):
+        how = {"rhs_dilation": rhs_dilation, "dimension_numbers": ("NHWC", "HWIO", "NHWC")}
+        return jax.lax.conv_general_dilated(image, kernel, strides, padding, **how)
+
+    return run
+
+
+IMAGE, KERNEL = (2, 12, 10, 3), (3, 4, 3, 5)
+
+
+@pytest.mark.parametrize(
+    "function, shapes",
+    [
+        (lambda x, y: x @ y, [(6, 5), (5, 7)]),
+        (lambda x, y: jnp.einsum("bij,bjk->bik", x, y), [(3, 6, 5), (3, 5, 7)]),
+        (_conv((1, 1), "SAME"), [IMAGE, KERNEL]),
+        (_conv((2, 3), "VALID"), [IMAGE, KERNEL]),
+        (_conv((1, 1), "SAME", (2, 1)), [IMAGE, KERNEL]),
+        *[(jax.vjp(_conv((2, 2), "SAME"), jnp.ones(IMAGE), jnp.ones(KERNEL))[1], [(2, 6, 5, 5)])],
+    ],
+)
+def test_operations_are_those_that_xla_counts(function, shapes):
+    traced = jax.jit(function).trace(*[jnp.ones(shape) for shape in shapes])
+    cost = traced.lower().cost_analysis()
+    assert cost is not None and compiling.flops(traced.jaxpr) == pytest.approx(cost["flops"], rel=0.02)
+
+
+def test_what_a_loop_does_is_counted_as_often_as_it_runs():
+    x, once = jnp.ones((8, 8)), 2 * 8**3
+
+    def count(function):
+        return compiling.flops(jax.jit(function).trace(x).jaxpr)
+
+    assert count(lambda x: jax.lax.scan(lambda c, _: (c @ c, None), x, length=7)[0]) == 7 * once
+    assert count(lambda x: jax.lax.map(lambda row: (x @ x) @ row, x)) == 8 * (once + 2 * 64)
+    assert count(lambda x: jax.lax.cond(x[0, 0] > 0, lambda: x @ x @ x, lambda: x @ x)) == 2 * once
+    assert count(lambda x: jax.lax.while_loop(lambda c: c[0, 0] < 9, lambda c: c @ c, x)) == once
+    assert count(lambda x: jnp.fft.fft(x.astype(jnp.complex64))) == 2 * count(jnp.fft.rfft) == 8 * 5 * 8 * 3

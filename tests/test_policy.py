@@ -13,7 +13,7 @@ import pytest
 from test_scoring import drawn_params
 from test_train_step import tiny_config
 
-from lala_jax import build, policy, types
+from lala_jax import build, options, policy, types
 from lala_jax.models import goal_aware, graph, transporter
 from lala_jax.perception import topdown, transforms
 from lala_jax.sim import oracle, tasks
@@ -538,3 +538,29 @@ def test_one_label_of_the_graph_policy_is_one_of_all():
     both = GRAPH.loss(params, jax.random.key(0), state, None, None)[0]
     drawn = {round(float(single.loss(params, jax.random.key(seed), state, None, None)[0]), 5) for seed in range(12)}
     assert len(drawn) == 2 and np.exp(-both) == pytest.approx(sum(np.exp(-one) for one in drawn), rel=1e-3)
+
+
+def test_networks_compute_in_bfloat16_where_the_config_says_so():
+    config = tiny_config("model.name=two_stream", "model.max_height=true")
+    half = build.build_policy(options.override(config, ["model.dtype=bfloat16"]))
+    whole, spec = build.build_policy(config), build.map_spec(config)
+    params = jax.jit(half.init)(jax.random.key(0, impl="rbg"))
+    assert {leaf.dtype for leaf in jax.tree.leaves(params)} == {jnp.dtype("float32")}
+    color = jax.random.uniform(jax.random.key(1), (spec.rows, spec.cols, spec.slices, 3))
+    shown = policy.empty_map(spec).replace(features=color, count=jnp.ones(color.shape[:3]))
+    found, want = (jax.jit(agent.act)(params, shown, policy.empty_map(spec))[1] for agent in (half, whole))
+    for mine, exact in ((found.pick, want.pick), (found.place, want.place)):
+        assert mine.dtype == jnp.float32
+        assert 0 < jnp.abs(mine - exact).max() < 0.05 * exact.std() + 0.02 * jnp.abs(exact).max()
+
+
+@pytest.mark.parametrize(
+    "overrides, message",
+    [
+        (("model.name=two_stream", "model.dtype=float16"), "model.dtype must be one of 'float32', 'bfloat16', got 'float16'"),
+        (("model.dtype=bfloat16",), "model.name 'goal_aware' computes in float32 only, got model.dtype='bfloat16'"),
+    ],
+)
+def test_a_dtype_that_a_network_does_not_have_is_refused(overrides, message):
+    with pytest.raises(options.OptionsError, match=message):
+        build.build_policy(tiny_config(*overrides))

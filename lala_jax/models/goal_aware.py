@@ -23,7 +23,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from lala_jax import types
-from lala_jax.models import correlation, strided
+from lala_jax.models import convolution, correlation
 from lala_jax.perception import image, topdown
 
 POOL = 2  # map cells per token cell, each way
@@ -146,7 +146,7 @@ class RefineNet(nn.Module):
     @nn.compact
     def __call__(self, x):
         x = nn.relu(nn.Conv(self.width, (3, 3))(x))
-        x = nn.relu(nn.Conv(self.width, (5, 5), strides=(2, 2), conv_general_dilated=strided.conv)(x))
+        x = nn.relu(nn.Conv(self.width, (5, 5), strides=(2, 2), conv_general_dilated=convolution.blocked)(x))
         x = nn.relu(nn.Conv(2 * self.width, (3, 3), strides=(2, 2))(x))
         x = nn.relu(nn.Conv(2 * self.width, (3, 3))(x))
         x = nn.relu(nn.Dense(4 * self.width)(x.ravel()))

@@ -1,4 +1,4 @@
-"""A strided convolution over blocks of cells against XLA's own, and its gradients."""
+"""A strided convolution over blocks of cells, and a 1x1 one as a product, against XLA's own, with their gradients."""
 
 import flax.linen as nn
 import jax
@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lala_jax.models import strided
+from lala_jax.models import convolution
 
 NUMBERS = ("NHWC", "HWIO", "NHWC")
 
@@ -23,7 +23,7 @@ def test_values_and_gradients_are_those_of_the_strided_convolution(strides, size
     kernel = jnp.asarray(rng.normal(size=(size, max(size - 1, 1), 3, 4)), jnp.float32)
 
     def ours(x, kernel):
-        return strided.conv(x, kernel, strides, "SAME", dimension_numbers=NUMBERS)
+        return convolution.blocked(x, kernel, strides, "SAME", dimension_numbers=NUMBERS)
 
     got, back = jax.vjp(ours, x, kernel)
     want, want_back = jax.vjp(lambda x, kernel: plain(x, kernel, strides), x, kernel)
@@ -38,16 +38,38 @@ def test_it_stands_in_in_flax_with_the_same_parameters():
     x = jax.random.normal(jax.random.key(0), (2, 8, 8, 3))
     layer = nn.Conv(4, (5, 5), strides=(2, 2))
     params = layer.init(jax.random.key(1), x)
-    got = nn.Conv(4, (5, 5), strides=(2, 2), conv_general_dilated=strided.conv).apply(params, x)
+    got = nn.Conv(4, (5, 5), strides=(2, 2), conv_general_dilated=convolution.blocked).apply(params, x)
     np.testing.assert_allclose(got, layer.apply(params, x), atol=1e-5)
 
 
 def test_nothing_is_dilated_backward():
     kernel = jnp.zeros((5, 5, 3, 4))
-    text = jax.jit(jax.grad(lambda x: strided.conv(x, kernel, (2, 2), "SAME", dimension_numbers=NUMBERS).sum()))
+    text = jax.jit(jax.grad(lambda x: convolution.blocked(x, kernel, (2, 2), "SAME", dimension_numbers=NUMBERS).sum()))
     assert "lhs_dilate = [2, 2]" not in text.lower(jnp.zeros((1, 8, 8, 3))).as_text()
     reference = jax.jit(jax.grad(lambda x: plain(x, kernel, (2, 2)).sum()))
     assert "lhs_dilate = [2, 2]" in reference.lower(jnp.zeros((1, 8, 8, 3))).as_text()
+
+
+@pytest.mark.parametrize("strides", [(1, 1), (2, 2), (3, 2)])
+def test_a_product_has_the_values_and_gradients_of_a_convolution_with_one_cell(strides):
+    x = jax.random.normal(jax.random.key(0), (2, 9, 12, 3))
+    layers = [
+        nn.Conv(4, (1, 1), strides, padding=0, conv_general_dilated=one) for one in (jax.lax.conv_general_dilated, convolution.pointwise)
+    ]
+    params = layers[0].init(jax.random.key(1), x)
+    want, got = (jax.value_and_grad(lambda p, x, layer=layer: jnp.sin(layer.apply(p, x)).sum(), (0, 1))(params, x) for layer in layers)
+    assert layers[1].apply(params, x).shape == layers[0].apply(params, x).shape
+    jax.tree.map(lambda mine, theirs: np.testing.assert_allclose(mine, theirs, atol=1e-4), got, want)
+
+
+@pytest.mark.parametrize(
+    "kernel, change",
+    [((3, 1), {}), ((1, 1), {"padding": [(0, 1), (0, 0)]}), ((1, 1), {"rhs_dilation": (2, 2)}), ((1, 1), {"feature_group_count": 3})],
+)
+def test_a_product_refuses_what_it_cannot_do(kernel, change):
+    how = {"window_strides": (1, 1), "padding": [(0, 0), (0, 0)]} | change
+    with pytest.raises(ValueError, match="needs a kernel of 1x1 without padding, dilation or groups, got"):
+        convolution.pointwise(jnp.zeros((1, 8, 8, 3)), jnp.zeros((*kernel, 3, 4)), **how)
 
 
 @pytest.mark.parametrize(
@@ -62,4 +84,4 @@ def test_nothing_is_dilated_backward():
 def test_what_it_cannot_do_is_refused(change, message):
     how = {"window_strides": (2, 2), "padding": "SAME", "dimension_numbers": NUMBERS} | change
     with pytest.raises(ValueError, match=message):
-        strided.conv(jnp.zeros((1, 8, 8, 3)), jnp.zeros((3, 3, 3, 4)), **how)
+        convolution.blocked(jnp.zeros((1, 8, 8, 3)), jnp.zeros((3, 3, 3, 4)), **how)
