@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from lala_jax import types
-from lala_jax.perception import noise, transforms
+from lala_jax.perception import batches, noise, transforms
 
 CANDIDATES = 64  # colours drawn uniformly, out of which those of the objects are chosen
 
@@ -50,7 +50,7 @@ def sensors(key: jax.Array, key_noise: jax.Array, views: types.Views, errors: Se
 def sensors_batch(key: jax.Array, key_noise: jax.Array, views: types.Views, errors: Sensors, *, disparity: float) -> types.Views:
     """Let the cameras of B scenes (leaves `[B, V, ...]`, keys `[B]`) err, as `sensors` says.
 
-    One scene after the other on a CPU, where noise that is not wanted is then not drawn; all at once elsewhere.
+    On a CPU noise that is not wanted is not drawn (`batches.each`).
     """
 
     def one(scene):
@@ -58,8 +58,7 @@ def sensors_batch(key: jax.Array, key_noise: jax.Array, views: types.Views, erro
         return sensors(key, key_noise, views, errors, disparity=disparity)
 
     scenes = (key, key_noise, views.replace(rgb=None))  # which would be copied for nothing
-    erring = jax.lax.map(one, scenes) if jax.default_backend() == "cpu" else jax.vmap(one)(scenes)
-    return erring.replace(rgb=views.rgb)
+    return batches.each(one, scenes).replace(rgb=views.rgb)
 
 
 def recolor(

@@ -6,13 +6,16 @@ paper, the query sees the goal image *at the pick cell*, which in these tasks is
 
 from __future__ import annotations
 
+import math
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import linen as nn
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from lala_jax.models import blocks, correlation, streams
-from lala_jax.perception import image
+from lala_jax.perception import batches, image
 
 VARIANTS = (*streams.VARIANTS, "transporter", "image_goal", "goal_split")
 
@@ -48,7 +51,8 @@ def pick_crops(maps: Float[Array, "rows cols c"], pick_cell: Int[Array, 2], *, y
 
     The cell lands on index `crop // 2`, where `correlation.correlate` looks for a kernel's centre.
     """
-    return image.rotate_crop(maps, pick_cell.astype(jnp.float32) + 0.5, yaw_bins, crop)
+    offsets = jnp.asarray(image.rotation_offsets(2 * math.pi / yaw_bins * np.arange(yaw_bins), crop), jnp.float32)
+    return batches.each(lambda offset: image.sample(maps, pick_cell.astype(jnp.float32) + 0.5 + offset), offsets)
 
 
 def place_logits(

@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from lala_jax import types
+from lala_jax.perception import batches, image
 from lala_jax.perception import camera as cameras
-from lala_jax.perception import image
 
 
 def fuse(
@@ -100,18 +100,13 @@ def from_views_batch(
 ) -> types.TopDownMap:
     """Fuse the views of B scenes (leaves `[B, V, ...]`); the margins are those of `fuse`.
 
-    `method` is "map" (one scene after the other), "vmap" (all at once) or "auto": map on a CPU, where a batched scatter
-    costs four times the loop, vmap elsewhere.
+    `method` is that of `batches.each`: on a CPU a batched scatter costs four times the loop.
     """
-    if method not in ("auto", "map", "vmap"):
-        raise ValueError(f"from_views_batch: method must be auto, map or vmap, got {method!r}")
-    if method == "auto":
-        method = "map" if jax.default_backend() == "cpu" else "vmap"
 
     def one(example):
         return from_views(example[0], spec=spec, features=example[1], **margins)
 
-    return jax.lax.map(one, (views, features)) if method == "map" else jax.vmap(one)((views, features))
+    return batches.each(one, (views, features), method=method)
 
 
 def surface_features(
