@@ -126,7 +126,8 @@ def surface_features(
     scale = np.array([features.shape[1] / views.depth.shape[1], features.shape[2] / views.depth.shape[2]], np.float32)
     most = np.array(features.shape[1:3], np.float32) - 0.5  # past the outermost centres the outermost values hold
 
-    def one(depth, camera, grid):
+    def one(view):
+        depth, camera, grid = view
         points = cameras.unproject(depth, camera).reshape(-1, 3)
         _, cell, height = _locate(points, (depth > 0).ravel(), spec, floor_margin, surface_margin)
         top = jnp.full(spec.rows * spec.cols, -jnp.inf).at[cell].max(height, **_DROP)
@@ -136,7 +137,7 @@ def surface_features(
         seen = (pixel >= 0)[:, None]
         return jnp.where(seen, image.sample(grid, jnp.clip(at, 0.5, most)), 0.0), seen
 
-    value, seen = jax.vmap(one)(views.depth, views.camera, features)
+    value, seen = batches.each(one, (views.depth, views.camera, features))
     return (value.sum(0) / jnp.maximum(seen.sum(0), 1)).reshape(spec.rows, spec.cols, -1)
 
 
