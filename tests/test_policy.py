@@ -554,6 +554,17 @@ def test_networks_compute_in_bfloat16_where_the_config_says_so():
         assert 0 < jnp.abs(mine - exact).max() < 0.05 * exact.std() + 0.02 * jnp.abs(exact).max()
 
 
+@pytest.mark.parametrize("low", [-4, np.nan, -np.inf])
+def test_the_largest_entry_is_the_first_of_equals(low):
+    rng = np.random.default_rng(0)
+    for shape in ((7,), (4, 5, 6)):
+        logits = rng.integers(-3, 3, shape).astype(np.float32)
+        logits[rng.uniform(size=shape) < 0.2] = low
+        for some in (logits, np.full(shape, low, np.float32)):
+            found = jax.jit(policy.argmax_index)(jnp.asarray(some))
+            assert tuple(map(int, found)) == np.unravel_index(np.argmax(some), shape) and found[0].dtype == jnp.int32
+
+
 @pytest.mark.parametrize(
     "overrides, message",
     [
