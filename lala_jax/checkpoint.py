@@ -96,21 +96,16 @@ class Checkpoints:
         and dtype; CheckpointError where steps exist and none is intact, or where processes do not see the same steps.
         """
         folder = self.directory / "latest"
-        problems = []
-        if parallel.anywhere(parallel.first(lambda: _steps(folder)) != _steps(folder)):
+        steps = _steps(folder)
+        if parallel.anywhere(parallel.first(lambda: steps) != steps):
             raise CheckpointError(f"{folder} must be one directory that all processes share: they do not see the same steps in it")
-        for step in _steps(folder):
-            try:
-                return step, _restore(folder, step, template)
-            except MismatchError:
-                raise
-            except CheckpointError as error:
-                _LOG.warning("passing over %s", error)
-                self._damaged.add(folder / str(step))
-                problems.append(str(error))
-        if problems:
-            raise CheckpointError(f"no intact checkpoint in {folder}:\n" + "\n".join(problems))
-        return None
+        if not steps:
+            return None
+
+        def read(folder: pathlib.Path, step: int) -> tuple[int, Any]:
+            return step, _restore(folder, step, template)
+
+        return _first_intact(f"in {folder}", [(folder, step) for step in steps], read, damaged=self._damaged)
 
     def _drop_damaged(self, folder: pathlib.Path) -> None:
         whole = _steps(folder)
@@ -129,7 +124,7 @@ def load(path: str | os.PathLike[str], template: Any = None, *, which: str = "be
         state, side = _restore(folder, step, template), _read_side(folder, step)
         return state, side["config"], side["input_spec"]
 
-    return _first_intact(path, which, read)
+    return _first_intact(f"at {path}", _candidates(pathlib.Path(path).absolute(), which), read)
 
 
 def describe(path: str | os.PathLike[str], *, which: str = "best") -> dict[str, Any]:
@@ -140,13 +135,19 @@ def describe(path: str | os.PathLike[str], *, which: str = "best") -> dict[str, 
         _check_files(folder / str(step), side)
         return {"step": step, **side}
 
-    return _first_intact(path, which, read)
+    return _first_intact(f"at {path}", _candidates(pathlib.Path(path).absolute(), which), read)
 
 
-def _first_intact(path: str | os.PathLike[str], which: str, read: Callable[[pathlib.Path, int], _Read]) -> _Read:
-    """Give what `read` makes of the first of a path's steps that is intact; damaged ones are logged and passed over."""
+def _first_intact(
+    where: str,
+    steps: Iterable[tuple[pathlib.Path, int]],
+    read: Callable[[pathlib.Path, int], _Read],
+    *,
+    damaged: set[pathlib.Path] | None = None,
+) -> _Read:
+    """Give what `read` makes of the first of `steps` that is intact; damaged ones are logged, added to `damaged` and passed over."""
     problems = []
-    for folder, step in _candidates(pathlib.Path(path).absolute(), which):
+    for folder, step in steps:
         try:
             return read(folder, step)
         except MismatchError:
@@ -154,7 +155,9 @@ def _first_intact(path: str | os.PathLike[str], which: str, read: Callable[[path
         except CheckpointError as error:
             _LOG.warning("passing over %s", error)
             problems.append(str(error))
-    raise CheckpointError(f"no intact checkpoint at {path}:\n" + "\n".join(problems))
+            if damaged is not None:
+                damaged.add(folder / str(step))
+    raise CheckpointError(f"no intact checkpoint {where}:\n" + "\n".join(problems))
 
 
 @contextlib.contextmanager
