@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import pathlib
+import signal
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -37,6 +40,14 @@ def mean_metrics(seen: Sequence[Metrics], *, last: int) -> dict[str, float]:
         check_finite(number, metrics)
     columns = {name: np.array([metrics[name] for metrics in host]) for name in host[0]}
     return {name: float(np.nan if np.isnan(values).all() else np.nanmean(values)) for name, values in columns.items()}
+
+
+@contextlib.contextmanager
+def session(out: pathlib.Path) -> Iterator[tuple[writers.Writer | None, Callable[[], bool]]]:
+    """Give the writer of a run's curves (None in all processes but the first), and whether a signal has asked the run to stop."""
+    opened = writers.Writer(out) if parallel.is_first() else contextlib.nullcontext()
+    with opened as writer, checkpoint.stop_signals((signal.SIGTERM, signal.SIGINT)) as stopped:
+        yield writer, stopped
 
 
 def start_or_resume(

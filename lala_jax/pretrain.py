@@ -7,10 +7,8 @@ for bit.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import pathlib
-import signal
 from collections.abc import Mapping
 from typing import Any
 
@@ -82,9 +80,8 @@ def pretrain(config, workdir: str) -> pathlib.Path:
     parallel.first(lambda: writers.write_json(out / "config.json", options.to_dict(config)))
     kept, all_ = (state.parameter_count(tree) for tree in (run.params["encoder"], run.params))
     parallel.say(f"{config.task.name}: {kept:,} of {all_:,} parameters to keep, {len(states.size)} states, step {int(run.step)}")
-    opened = writers.Writer(out) if parallel.is_first() else contextlib.nullcontext()
     stored = {"config": options.to_dict(config), "input_spec": {"encoder": recipe.model.stage}}
-    with opened as writer, checkpoint.stop_signals((signal.SIGTERM, signal.SIGINT)) as stopped:
+    with loop.session(out) as (writer, stopped):
         run = loop.run(
             lambda run: loop.compiled(step, recipe, run, states, frozen, key), run, total=config.pretrain.steps,
             log_every=config.train.log_every, save_every=config.train.save_every,

@@ -7,9 +7,7 @@ for bit. Several devices share every batch, and the processes that a scheduler s
 
 from __future__ import annotations
 
-import contextlib
 import pathlib
-import signal
 from collections.abc import Mapping
 from typing import Any
 
@@ -48,8 +46,7 @@ def train_and_evaluate(config, workdir: str) -> dict[str, Any]:
     shared = "" if recipe.mesh is None else f", {recipe.mesh.size} devices"
     parallel.say(f"{config.task.name}: {count:,} parameters, {states.size.shape[0]} states, step {int(run.step)}{shared}")
     stored = {"config": options.to_dict(config), "input_spec": build.input_spec(config)}
-    opened = writers.Writer(out) if parallel.is_first() else contextlib.nullcontext()
-    with opened as writer, checkpoint.stop_signals((signal.SIGTERM, signal.SIGINT)) as stopped:
+    with loop.session(out) as (writer, stopped):
         if run.step > 0 and validation_due(config, int(run.step)) and not parallel.first(lambda: was_validated(out, int(run.step))):
             _validate(config, recipe, run, store, stored, writer)  # the last run was stopped between saving and scoring
         run = _loop(config, recipe, run, states, store, stored, writer, stopped)
