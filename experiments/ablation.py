@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from experiments import common
-from lala_jax import build, cluster, options
+from lala_jax import build, cluster, compiling, options
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,4 +111,5 @@ def command(argv: Sequence[str] | None = None):
 if __name__ == "__main__":
     from experiments import ablation as module  # the name under which workers find what they are sent
 
+    compiling.keep()
     module.command()

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from experiments import common
-from lala_jax import build, cluster, options
+from lala_jax import build, cluster, compiling, options
 
 FLAGS = {"task": "tower", "demos": "500,50,10", "seeds": "0,1,2", "split": "test", "start": 0, "episodes": 100, "out": "", **cluster.FLAGS}
 
@@ -106,4 +106,5 @@ def command(argv: Sequence[str] | None = None):
 if __name__ == "__main__":
     from experiments import main_table as module  # the name under which workers find what they are sent
 
+    compiling.keep()
     module.command()

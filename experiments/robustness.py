@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments import common
-from lala_jax import build, cluster, evaluate, options, publish, rollout
+from lala_jax import build, cluster, compiling, evaluate, options, publish, rollout
 from lala_jax import checkpoint as checkpoints
 from lala_jax.sim import oracle
 from lala_jax.sim.tasks import base
@@ -125,4 +125,5 @@ def command(argv: Sequence[str] | None = None):
 if __name__ == "__main__":
     from experiments import robustness as module  # the name under which workers find what they are sent
 
+    compiling.keep()
     module.command()

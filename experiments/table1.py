@@ -25,7 +25,7 @@ from typing import Any
 import jax
 
 from experiments import common
-from lala_jax import build, cluster, options, pretrain, scoring, state
+from lala_jax import build, cluster, compiling, options, pretrain, scoring, state
 from lala_jax.sim import tasks
 
 
@@ -315,4 +315,5 @@ def command(argv: Sequence[str] | None = None):
 if __name__ == "__main__":
     from experiments import table1 as module  # the name under which workers find what they are sent
 
+    compiling.keep()
     module.command()
