@@ -299,8 +299,9 @@ def bars(results: Mapping[str, Mapping[str, Mapping[str, Any]]], path: pathlib.P
             if name in rows:
                 axis.axvline(rows[name]["score"], color="black", linestyle=style, label=name.replace("_", " "))
         axis.set(title=task, xlim=(0, 100), xlabel="score", yticks=range(len(shown)), yticklabels=[entry.label for entry in shown])
-        if axis.get_legend_handles_labels()[0]:
-            axis.legend(loc="lower right", fontsize="small")
+    told = {text: handle for axis in axes for handle, text in zip(*axis.get_legend_handles_labels(), strict=True)}
+    if told:
+        drawing.legend(list(told.values()), list(told), loc="outside lower center", ncols=len(told), fontsize="small")
     axes[0].invert_yaxis()
     drawing.savefig(path, dpi=100)
 
