@@ -363,9 +363,6 @@ STAGES = {
     ),
     "train-paper": timing.Stage("training step, paper's size", "sample", paper_step),
     "train-paper-bfloat16": timing.Stage("the same in bfloat16, batch 8", "sample", functools.partial(paper_step, **LARGE), platform="gpu"),
-    "train-paper-plain": timing.Stage(
-        "the same without a backbone", "sample", functools.partial(paper_step, **LARGE, **{"camera.backbone": ""}), platform="gpu"
-    ),
     "train-paper-network": timing.Stage("the same on given maps without a backbone", "sample", paper_network, alone=True),
     "train-paper-network-bfloat16": timing.Stage(
         "that in bfloat16, batch 8", "sample", functools.partial(paper_network, batch=8, dtype=jnp.bfloat16), platform="gpu"

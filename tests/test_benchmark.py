@@ -173,14 +173,29 @@ def test_every_stage_runs(name, monkeypatch):
     monkeypatch.setattr(scoring, "check_checkpoint", lambda *_: jax.tree.map(lambda leaf: jnp.zeros(leaf.shape), params))
     row = timing.timed(name, benchmark_stages.STAGES, config, repeats=1)
     assert "unavailable" in row or row["seconds"] > 0 and row["runs"] == 1 and row["recompiled"] == 0
-    assert name == "render-mujoco" or "unavailable" not in row
+    elsewhere = benchmark_stages.STAGES[name].platform not in ("", jax.default_backend())
+    assert name == "render-mujoco" or row.get("unavailable") == ("needs a GPU" if elsewhere else None)
     assert benchmark.table([{**row, "share": {}}]).count("\n") == 2
+
+
+@pytest.mark.parametrize("name, count", [("observe-many", 64), ("train-many", 64)])
+def test_what_is_timed_on_a_gpu_runs_here_too(name, count, monkeypatch):
+    monkeypatch.setattr(benchmark_stages, "FULL", {})
+    row = timing.measured(benchmark_stages.STAGES[name].prepare(tiny_config()), 1)
+    assert row["count"] == count and row["seconds"] > 0
+
+
+def test_the_papers_network_learns_from_several_examples_in_bfloat16():
+    sizes = {"yaw_bins": 2, "crop": 4, "channels": 2, "width": 8, "stages": 1}
+    works = [benchmark_stages.paper_network(None, rows=16, cols=8, batch=n, dtype=jnp.bfloat16, **sizes) for n in (1, 3)]
+    assert [timing.measured(work, 1)["count"] for work in works] == [1, 3]
+    assert works[1].facts["flops"] == pytest.approx(3 * works[0].facts["flops"], rel=0.05)
 
 
 def test_the_papers_network_takes_adams_steps(monkeypatch):
     """What is timed trains: its first step moves every parameter that has a gradient by the learning rate, as Adam's does."""
     found = []
-    monkeypatch.setattr(timing, "stepping", lambda step, run, *inputs: found.append((run, step(run, *inputs)[0])))
+    monkeypatch.setattr(timing, "stepping", lambda step, run, *inputs, **_: found.append((run, step(run, *inputs)[0])))
     sizes = {"yaw_bins": 2, "crop": 4, "channels": 2, "width": 8, "stages": 1}
     monkeypatch.setattr(compiling, "jit", lambda step, **_: jax.jit(step))  # nothing donated: both are looked at
     benchmark_stages.paper_network(None, rows=16, cols=8, **sizes)
