@@ -124,7 +124,7 @@ def load(path: str | os.PathLike[str], template: Any = None, *, which: str = "be
         state, side = _restore(folder, step, template), _read_side(folder, step)
         return state, side["config"], side["input_spec"]
 
-    return _first_intact(f"at {path}", _candidates(pathlib.Path(path).absolute(), which), read)
+    return _first_at(path, which, read)
 
 
 def describe(path: str | os.PathLike[str], *, which: str = "best") -> dict[str, Any]:
@@ -135,6 +135,11 @@ def describe(path: str | os.PathLike[str], *, which: str = "best") -> dict[str, 
         _check_files(folder / str(step), side)
         return {"step": step, **side}
 
+    return _first_at(path, which, read)
+
+
+def _first_at(path: str | os.PathLike[str], which: str, read: Callable[[pathlib.Path, int], _Read]) -> _Read:
+    """Give what `read` makes of the step that `load` reads."""
     return _first_intact(f"at {path}", _candidates(pathlib.Path(path).absolute(), which), read)
 
 

@@ -70,7 +70,7 @@ IMAGE, KERNEL = (2, 12, 10, 3), (3, 4, 3, 5)
         (_conv((1, 1), "SAME"), [IMAGE, KERNEL]),
         (_conv((2, 3), "VALID"), [IMAGE, KERNEL]),
         (_conv((1, 1), "SAME", (2, 1)), [IMAGE, KERNEL]),
-        *[(jax.vjp(_conv((2, 2), "SAME"), jnp.ones(IMAGE), jnp.ones(KERNEL))[1], [(2, 6, 5, 5)])],
+        (jax.vjp(_conv((2, 2), "SAME"), jnp.ones(IMAGE), jnp.ones(KERNEL))[1], [(2, 6, 5, 5)]),
     ],
 )
 def test_operations_are_those_that_xla_counts(function, shapes):

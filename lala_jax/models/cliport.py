@@ -13,7 +13,6 @@ from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import linen as nn
 from jaxtyping import Array, ArrayLike, Float, Int
 
@@ -259,8 +258,8 @@ def turned_features(
     features: Float[Array, "rows cols c"], pick_cell: Int[Array, 2], *, yaw_bins: int, crop: int, stride: int
 ) -> Float[Array, "k side side c"]:
     """Cut `yaw_bins` crops of features at a stride, turned as `transporter.pick_crops` turns the map; `side` is `crop / stride`."""
-    offsets = image.rotation_offsets(2 * math.pi / yaw_bins * np.arange(yaw_bins), crop)[:, ::stride, ::stride]
-    return image.sample(features, (pick_cell + jnp.asarray(offsets, jnp.float32)) / stride + 0.5)
+    offsets = image.whole_turn_offsets(yaw_bins, crop)[:, ::stride, ::stride]
+    return image.sample(features, (pick_cell + offsets) / stride + 0.5)
 
 
 def _stride(maps: jax.Array, features: jax.Array) -> int:

@@ -6,11 +6,8 @@ paper, the query sees the goal image *at the pick cell*, which in these tasks is
 
 from __future__ import annotations
 
-import math
-
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import linen as nn
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
@@ -51,7 +48,7 @@ def pick_crops(maps: Float[Array, "rows cols c"], pick_cell: Int[Array, 2], *, y
 
     The cell lands on index `crop // 2`, where `correlation.correlate` looks for a kernel's centre.
     """
-    offsets = jnp.asarray(image.rotation_offsets(2 * math.pi / yaw_bins * np.arange(yaw_bins), crop), jnp.float32)
+    offsets = image.whole_turn_offsets(yaw_bins, crop)
     return batches.each(lambda offset: image.sample(maps, pick_cell.astype(jnp.float32) + 0.5 + offset), offsets)
 
 

@@ -43,6 +43,11 @@ def rotation_offsets(yaw, size: int):
     return xp.stack([cos * y - sin * x, cos * x + sin * y], axis=-1)
 
 
+def whole_turn_offsets(yaw_bins: int, size: int) -> Float[Array, "k size size 2"]:
+    """Give the `rotation_offsets` of `k = yaw_bins` crops, crop `b` turned by `+2 pi b / k`."""
+    return jnp.asarray(rotation_offsets(2 * math.pi / yaw_bins * np.arange(yaw_bins), size), jnp.float32)
+
+
 def turned_crop(
     image: Float[Array, "rows cols c"], center: Num[Array | np.ndarray, " 2"] | Sequence, yaw: Float[Array, ""], size: int
 ) -> Float[Array, "size size c"]:
@@ -59,6 +64,6 @@ def rotate_crop(
     The centre lands on the centre of crop cell `[size // 2, size // 2]`: give `(i + 0.5, j + 0.5)` to turn about
     cell `[i, j]`. Bilinear, zero outside the image.
     """
-    offsets = jnp.asarray(rotation_offsets(2 * math.pi / yaw_bins * np.arange(yaw_bins), size), jnp.float32)
+    offsets = whole_turn_offsets(yaw_bins, size)
     center = jnp.broadcast_to(jnp.asarray(center, jnp.float32), offsets.shape)
     return sample(image, center + offsets)
