@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -19,9 +19,9 @@ def blocked(lhs: jax.Array, rhs: jax.Array, window_strides: Sequence[int], paddi
     Raises ValueError unless the padding is "SAME", the strides divide the sides and nothing is dilated or grouped.
     """
     batch, *sides, channels = lhs.shape
-    dilated = [name for name in ("lhs_dilation", "rhs_dilation") if any(step != 1 for step in kwargs.pop(name, None) or ())]
-    if padding != "SAME" or dilated or kwargs.pop("feature_group_count", 1) != 1:
-        raise ValueError(f"needs padding SAME without dilation or groups, got padding {padding!r} and {dilated or 'groups'}")
+    kwargs = _plain(kwargs)
+    if padding != "SAME":
+        raise ValueError(f"needs padding SAME, got padding {padding!r}")
     if any(side % step for side, step in zip(sides, window_strides, strict=True)):
         raise ValueError(f"strides {tuple(window_strides)} must divide the sides {tuple(sides)}")
     pads, room, blocks = [], [], []
@@ -49,8 +49,50 @@ def pointwise(
     Maps `lhs` `[B, H, W, C]` and `rhs` `[1, 1, C, O]` to `[B, H / sh, W / sw, O]`, rounded up. On a GPU XLA fuses a product with what is
     around it, and hands a convolution to a library. Raises ValueError for a larger kernel, padding, dilation or groups.
     """
-    dilated = any(step != 1 for name in ("lhs_dilation", "rhs_dilation") for step in kwargs.get(name) or ())
-    if rhs.shape[:2] != (1, 1) or any(pair != (0, 0) for pair in padding) or dilated or kwargs.get("feature_group_count", 1) != 1:
-        raise ValueError(f"needs a kernel of 1x1 without padding, dilation or groups, got {rhs.shape[:2]}, padding {padding!r}, {kwargs}")
+    kwargs = _plain(kwargs)
+    if rhs.shape[:2] != (1, 1) or any(pair != (0, 0) for pair in padding):
+        raise ValueError(f"needs a kernel of 1x1 without padding, got {rhs.shape[:2]} and padding {padding!r}")
     down, right = window_strides
     return jnp.matmul(lhs[:, ::down, ::right], rhs[0, 0], precision=kwargs.get("precision"))
+
+
+def narrowing(
+    lhs: jax.Array, rhs: jax.Array, window_strides: Sequence[int], padding: Sequence[tuple[int, int]], **kwargs: Any
+) -> jax.Array:
+    """Take a convolution of many channels into few with its kernel's gradient as one matrix product.
+
+    Maps `lhs` `[B, H, W, C]` and `rhs` `[kh, kw, C, O]` to `[B, H', W', O]`. XLA's gradient is a convolution over `lhs` with channels in
+    the place of the batch, and a CPU brings `lhs` into that order first, entry by entry, with whatever made it. The product reads it as it
+    lies, and for each entry of the kernel the slope: `kh kw O` values a cell, so `C` should be larger than that.
+
+    Raises ValueError for strides, dilation or groups. There is no derivative in forward mode.
+    """
+    kwargs = _plain(kwargs)
+    if any(step != 1 for step in window_strides):
+        raise ValueError(f"needs strides of 1, got {tuple(window_strides)}")
+
+    def plain(lhs: jax.Array, rhs: jax.Array) -> jax.Array:
+        return jax.lax.conv_general_dilated(lhs, rhs, (1, 1), padding, **kwargs)
+
+    def backward(kept: tuple[jax.Array, jax.Array], slope: jax.Array) -> tuple[jax.Array, jax.Array]:
+        lhs, rhs = kept
+        (down, right, *_), (_, rows, cols, _) = rhs.shape, lhs.shape
+        room = [(size - 1 - low, size - 1 - high, 0) for size, (low, high) in zip((down, right), padding, strict=True)]
+        wide = jax.lax.pad(slope, jnp.zeros((), slope.dtype), [(0, 0, 0), *room, (0, 0, 0)])
+        moved = [wide[:, i : i + rows, j : j + cols] for i in reversed(range(down)) for j in reversed(range(right))]
+        product = jnp.einsum("bhwc,bhwno->nco", lhs, jnp.stack(moved, -2), precision=kwargs.get("precision"))
+        return jax.vjp(lambda lhs: plain(lhs, rhs), lhs)[1](slope)[0], product.reshape(rhs.shape)
+
+    convolve = jax.custom_vjp(plain)
+    convolve.defvjp(lambda lhs, rhs: (plain(lhs, rhs), (lhs, rhs)), backward)
+    return convolve(lhs, rhs)
+
+
+def _plain(kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    """Take from a convolution's arguments what says that it is neither dilated nor grouped; raises ValueError where it is."""
+    rest = dict(kwargs)
+    dilated = [name for name in ("lhs_dilation", "rhs_dilation") if any(step != 1 for step in rest.pop(name, None) or ())]
+    groups = rest.pop("feature_group_count", 1)
+    if dilated or groups != 1:
+        raise ValueError(f"needs a convolution without dilation or groups, got {dilated or f'{groups} groups'}")
+    return rest

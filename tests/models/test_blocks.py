@@ -130,6 +130,18 @@ def test_what_a_gpu_computes_is_the_same(monkeypatch):
     np.testing.assert_allclose(program.compile()(params), want, atol=1e-4)
 
 
+def test_slopes_are_the_same_with_many_channels(monkeypatch):
+    """Those of a stem that takes the kernel's gradient as a product, on a CPU, and those of XLA's convolution elsewhere."""
+    net, image = blocks.ResNet43_8s(2, width=4, stages=2), jax.random.normal(jax.random.key(0), (2, 8, 12, 40))
+    params = jax.jit(net.init)(jax.random.key(1, impl="rbg"), image)
+    found = []
+    for platform in ("cpu", "tpu"):
+        monkeypatch.setattr(jax, "default_backend", lambda platform=platform: platform)
+        found.append(jax.jit(jax.grad(lambda params: jnp.sin(net.apply(params, image)[0]).sum())).lower(params))
+    assert ["dot_general" in program.as_text() for program in found] == [True, False]
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), *[program.compile()(params) for program in found])
+
+
 def test_refuses_sides_that_do_not_divide():
     with pytest.raises(ValueError, match=r"sides divisible by 8, got \(60, 64, 3\)"):
         _abstract(blocks.ResNet43_8s(1), 60, 64, 3)

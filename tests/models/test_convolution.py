@@ -1,4 +1,4 @@
-"""A strided convolution over blocks of cells, and a 1x1 one as a product, against XLA's own, with their gradients."""
+"""Convolutions over blocks of cells, as a product, and with a gradient of their own, against XLA's, with all gradients."""
 
 import flax.linen as nn
 import jax
@@ -62,13 +62,39 @@ def test_a_product_has_the_values_and_gradients_of_a_convolution_with_one_cell(s
     jax.tree.map(lambda mine, theirs: np.testing.assert_allclose(mine, theirs, atol=1e-4), got, want)
 
 
+@pytest.mark.parametrize("size, padding", [((3, 3), ((1, 1), (1, 1))), ((2, 3), ((0, 3), (4, 0))), ((1, 1), ((0, 0), (0, 0)))])
+def test_the_kernels_gradient_as_a_product_is_that_of_the_convolution(size, padding):
+    """Of a batch of images, and of batches that `vmap` makes."""
+    rng = np.random.default_rng(0)
+    x, kernel = (jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in ((2, 3, 6, 8, 5), (*size, 5, 4)))
+
+    def loss(x, kernel, convolve):
+        return jnp.sin(jax.vmap(lambda x: convolve(x, kernel, (1, 1), padding, dimension_numbers=NUMBERS))(x)).sum()
+
+    both = convolution.narrowing, jax.lax.conv_general_dilated
+    (got, slopes), (want, expected) = (jax.value_and_grad(loss, (0, 1))(x, kernel, one) for one in both)
+    np.testing.assert_allclose(got, want, rtol=1e-5)
+    jax.tree.map(lambda mine, theirs: np.testing.assert_allclose(mine, theirs, atol=1e-4), slopes, expected)
+
+
+def test_the_input_is_not_turned_for_it():
+    x, kernel = jnp.zeros((4, 8, 8, 40)), jnp.zeros((3, 3, 40, 4))
+
+    def text(convolve):
+        grad = jax.grad(lambda kernel: convolve(x, kernel, (1, 1), ((1, 1), (1, 1)), dimension_numbers=NUMBERS).sum())
+        return jax.jit(grad).lower(kernel).as_text()
+
+    turned = "dim_numbers = [f, 0, 1, b]x"
+    assert turned in text(jax.lax.conv_general_dilated) and turned not in text(convolution.narrowing)
+
+
 @pytest.mark.parametrize(
     "kernel, change",
     [((3, 1), {}), ((1, 1), {"padding": [(0, 1), (0, 0)]}), ((1, 1), {"rhs_dilation": (2, 2)}), ((1, 1), {"feature_group_count": 3})],
 )
 def test_a_product_refuses_what_it_cannot_do(kernel, change):
     how = {"window_strides": (1, 1), "padding": [(0, 0), (0, 0)]} | change
-    with pytest.raises(ValueError, match="needs a kernel of 1x1 without padding, dilation or groups, got"):
+    with pytest.raises(ValueError, match=r"needs a (kernel of 1x1 without padding|convolution without dilation or groups), got"):
         convolution.pointwise(jnp.zeros((1, 8, 8, 3)), jnp.zeros((*kernel, 3, 4)), **how)
 
 
@@ -85,3 +111,10 @@ def test_what_it_cannot_do_is_refused(change, message):
     how = {"window_strides": (2, 2), "padding": "SAME", "dimension_numbers": NUMBERS} | change
     with pytest.raises(ValueError, match=message):
         convolution.blocked(jnp.zeros((1, 8, 8, 3)), jnp.zeros((3, 3, 3, 4)), **how)
+
+
+@pytest.mark.parametrize("change, message", [({"window_strides": (2, 1)}, "strides of 1"), ({"feature_group_count": 3}, "got 3 groups")])
+def test_what_has_no_gradient_of_its_own_is_refused(change, message):
+    how = {"window_strides": (1, 1), "padding": ((1, 1), (1, 1))} | change
+    with pytest.raises(ValueError, match=message):
+        convolution.narrowing(jnp.zeros((1, 8, 8, 3)), jnp.zeros((3, 3, 3, 4)), **how)
