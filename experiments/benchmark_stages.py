@@ -28,17 +28,10 @@ FULL = {"camera.height": 480, "camera.width": 640}  # the cameras' own resolutio
 EGL = {"MUJOCO_GL": "egl"} if sys.platform == "linux" else {}  # renders without a display
 
 
-def matrix_product(config) -> timing.Work:
-    """Multiply two matrices of 2048 x 2048."""
+def matrix_product(config, *, side: int = 2048, dtype: jnp.dtype = jnp.float32) -> timing.Work:
+    """Multiply two matrices of `side x side`."""
     del config
-    x = jax.random.normal(jax.random.key(0), (2048, 2048))
-    return timing.compiled(jnp.matmul, x, x)
-
-
-def matrix_product_bfloat16(config) -> timing.Work:
-    """Multiply two matrices of 8192 x 8192 in bfloat16."""
-    del config
-    x = jax.random.normal(jax.random.key(0), (8192, 8192), jnp.bfloat16)
+    x = jax.random.normal(jax.random.key(0), (side, side), dtype)
     return timing.compiled(jnp.matmul, x, x)
 
 
@@ -338,7 +331,12 @@ CEILINGS = {"matmul": "flops", "copy": "bytes"}
 LARGE = {"model.dtype": "bfloat16", "train.batch_size": 8}  # how a GPU takes the paper's step
 STAGES = {
     "matmul": timing.Stage("matrix product 2048 x 2048", "product", matrix_product),
-    "matmul-bfloat16": timing.Stage("matrix product 8192 x 8192, bfloat16", "product", matrix_product_bfloat16, platform="gpu"),
+    "matmul-bfloat16": timing.Stage(
+        "matrix product 8192 x 8192, bfloat16",
+        "product",
+        functools.partial(matrix_product, side=8192, dtype=jnp.bfloat16),
+        platform="gpu",
+    ),
     "copy": timing.Stage("reading and writing 256 MB", "copy", copy),
     "import": timing.Stage("starting Python and importing lala_jax", "start", start_up),
     "first-step": timing.Stage("from starting Python to the first training step", "start", functools.partial(first_step, cached=False)),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -25,93 +26,48 @@ class Target:
     platform: str = ""  # the only one of JAX's that it is about
 
 
-def seconds(row: Row) -> float:
-    return row["seconds"]
-
-
 def ratio(row: Row, other: Row, *, field: str = "seconds") -> float:
     return row[field] / other[field]
 
 
-def hundred(row: Row) -> float:
-    return 100 * row["seconds"]
-
-
-def training(row: Row) -> float:
-    return 20_000 * row["seconds"]
-
-
-def rates(row: Row, other: Row) -> float:
-    return ratio(row, other, field="flops_per_second")
-
-
-def peaks(row: Row, other: Row) -> float:
-    return ratio(row, other, field="process_memory")
+def seconds(row: Row, *, of: int = 1) -> float:
+    return of * row["seconds"]
 
 
 def again(*rows: Row) -> float:
     return sum(row["recompiled"] for row in rows)
 
 
+cpu, gpu = (functools.partial(Target, platform=platform) for platform in ("cpu", "gpu"))
+times = functools.partial(cpu, unit="times", compute=ratio, at_least=True)
+BOTH = ("train-paper-torch", "train-paper-network")
+LARGE = ("train-paper-bfloat16",)
 TARGETS = (
-    Target(
-        "mujoco.Renderer's time over ours, 4 views of 640 x 480",
-        10,
-        "times",
-        ("render-mujoco", "render"),
-        ratio,
-        at_least=True,
-        platform="cpu",
-    ),
-    Target("render, unproject and fuse an observation, batch 8", 0.025, "s", ("observe",), seconds, platform="cpu"),
-    Target(
-        "conv2d of PyTorch, time over our correlation's",
-        20,
-        "times",
-        ("correlate-torch", "correlate"),
-        ratio,
-        at_least=True,
-        platform="cpu",
-    ),
-    Target("direct convolution of JAX, likewise", 20, "times", ("correlate-direct", "correlate"), ratio, at_least=True, platform="cpu"),
-    Target(
-        "paper's step in PyTorch, time over ours",
-        6,
-        "times",
-        ("train-paper-torch", "train-paper-network"),
-        ratio,
-        at_least=True,
-        platform="cpu",
-    ),
-    Target(
-        "paper's step in PyTorch, memory over ours",
-        1,
-        "times",
-        ("train-paper-torch", "train-paper-network"),
-        peaks,
-        at_least=True,
-        platform="cpu",
-    ),
-    Target("paper's step in bfloat16, a sample", 0.01, "s", ("train-paper-bfloat16",), seconds, platform="gpu"),
-    Target("20,000 samples of it", 240, "s", ("train-paper-bfloat16",), training, platform="gpu"),
-    Target(
+    times("mujoco.Renderer's time over ours, 4 views of 640 x 480", 10, stages=("render-mujoco", "render")),
+    cpu("render, unproject and fuse an observation, batch 8", 0.025, "s", ("observe",), seconds),
+    times("conv2d of PyTorch, time over our correlation's", 20, stages=("correlate-torch", "correlate")),
+    times("direct convolution of JAX, likewise", 20, stages=("correlate-direct", "correlate")),
+    times("paper's step in PyTorch, time over ours", 6, stages=BOTH),
+    times("paper's step in PyTorch, memory over ours", 1, stages=BOTH, compute=functools.partial(ratio, field="process_memory")),
+    gpu("paper's step in bfloat16, a sample", 0.01, "s", LARGE, seconds),
+    gpu("20,000 samples of it", 240, "s", LARGE, functools.partial(seconds, of=20_000)),
+    gpu(
         "its network's rate over a matrix product's",
         0.35,
         "%",
         ("train-paper-network-bfloat16", "matmul-bfloat16"),
-        rates,
+        functools.partial(ratio, field="flops_per_second"),
         at_least=True,
-        platform="gpu",
     ),
-    Target("training step, a sample, batch 64", 0.001, "s", ("train-many",), seconds, platform="gpu"),
-    Target("render, unproject and fuse an observation, batch 64", 0.0005, "s", ("observe-many",), seconds, platform="gpu"),
+    gpu("training step, a sample, batch 64", 0.001, "s", ("train-many",), seconds),
+    gpu("render, unproject and fuse an observation, batch 64", 0.0005, "s", ("observe-many",), seconds),
     Target("a demonstration of a tower", 0.5, "s", ("collect",), seconds, task="tower"),
-    Target("closed loop of 100 episodes", 180, "s", ("evaluate",), hundred),
-    Target("input pipeline's share of the training step", 0.15, "%", ("inputs", "train"), ratio, platform="cpu"),
+    Target("closed loop of 100 episodes", 180, "s", ("evaluate",), functools.partial(seconds, of=100)),
+    cpu("input pipeline's share of the training step", 0.15, "%", ("inputs", "train"), ratio),
     Target("programs compiled again after a first run", 0, "", (), again),
     Target("starting Python and importing lala_jax", 0.3, "s", ("import",), seconds),
-    Target("first training step from a cold start", 60, "s", ("first-step",), seconds, platform="cpu"),
-    Target("first training step with kept programs", 15, "s", ("first-step-cached",), seconds, platform="cpu"),
+    cpu("first training step from a cold start", 60, "s", ("first-step",), seconds),
+    cpu("first training step with kept programs", 15, "s", ("first-step-cached",), seconds),
 )
 
 

@@ -282,9 +282,9 @@ def test_a_wrong_request_ends_with_one_message(arguments, message, capsys):
     assert message.split(".*")[0] in text and message.split(".*")[-1] in text
 
 
-def judge(name, rows, task="tower", platform="cpu"):
-    """Judge the one target whose first stage is `name`, and give its line of the table, too."""
-    target = next(target for target in benchmark_targets.TARGETS if target.stages[:1] == (name,))
+def judge(name, rows, task="tower", platform="cpu", *, label=""):
+    """Judge the one target whose first stage is `name` and whose label has `label`, and give its line of the table, too."""
+    (target,) = [target for target in benchmark_targets.TARGETS if target.stages[:1] == (name,) and label in target.label]
     found = benchmark_targets.judged(target, rows, task, platform)
     return found, benchmark_targets.table([found]).splitlines()[-1]
 
@@ -322,8 +322,9 @@ def test_a_target_that_cannot_be_judged_says_why():
 
 def test_some_targets_are_about_one_kind_of_machine():
     rows = rows_of(train_paper_bfloat16=0.009)
-    assert judge("train-paper-bfloat16", rows, platform="gpu")[1].endswith("| 9 ms | at most 10 ms | yes |")
-    assert judge("train-paper-bfloat16", rows)[1].endswith("| about a GPU | at most 10 ms | unknown |")
+    assert judge("train-paper-bfloat16", rows, platform="gpu", label="a sample")[1].endswith("| 9 ms | at most 10 ms | yes |")
+    assert judge("train-paper-bfloat16", rows, platform="gpu", label="20,000")[1].endswith("| 180 s | at most 240 s | yes |")
+    assert judge("train-paper-bfloat16", rows, label="a sample")[1].endswith("| about a GPU | at most 10 ms | unknown |")
     assert judge("render-mujoco", [], platform="gpu")[0]["unavailable"] == "about a CPU"
     fast = [{"name": name, "flops_per_second": value} for name, value in (("train-paper-network-bfloat16", 3.0), ("matmul-bfloat16", 10.0))]
     assert judge("train-paper-network-bfloat16", fast, platform="gpu")[1].endswith("| 30.0% | at least 35.0% | MISSED |")
