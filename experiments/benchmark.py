@@ -22,7 +22,7 @@ from typing import Any
 import jax
 
 from experiments import benchmark_stages, benchmark_targets, common, timing
-from lala_jax import options, writers
+from lala_jax import compiling, options, writers
 
 LIBRARIES = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "mujoco", "mujoco-mjx", "numpy")
 FLAGS = {
@@ -139,4 +139,5 @@ def command(argv: Sequence[str] | None = None):
 
 
 if __name__ == "__main__":
+    compiling.keep_memory()  # as the commands do that it is about
     command()

@@ -453,4 +453,5 @@ def grow(name: str, config, repeats: int) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
+    compiling.keep_memory()
     timing.serve(STAGES)

@@ -1,5 +1,10 @@
 """Programs are compiled once, counted right, and kept where the user's cache is."""
 
+import os
+import resource
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import pytest
@@ -21,26 +26,55 @@ def settings(monkeypatch, tmp_path):
 
 
 def test_programs_are_kept_in_the_users_cache(settings, tmp_path):
-    compiling.keep()
+    compiling.keep_programs()
     folder = tmp_path / "lala_jax" / "xla"
     assert settings.jax_compilation_cache_dir == str(folder) and folder.stat().st_mode & 0o777 == 0o700
 
 
 def test_where_the_user_says_otherwise_nothing_changes(settings, tmp_path):
     settings.update("jax_enable_compilation_cache", False)
-    compiling.keep()
+    compiling.keep_programs()
     assert settings.jax_compilation_cache_dir is None
     settings.update("jax_enable_compilation_cache", True)
     settings.update("jax_compilation_cache_dir", "elsewhere")
-    compiling.keep()
+    compiling.keep_programs()
     assert settings.jax_compilation_cache_dir == "elsewhere" and not any(tmp_path.iterdir())
 
 
 def test_a_cache_that_cannot_be_written_is_told(settings, monkeypatch, tmp_path, capsys):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    compiling.keep()
+    compiling.keep_programs()
     assert settings.jax_compilation_cache_dir is None and "compiled programs are not kept" in capsys.readouterr().err
+
+
+FAULTS = """
+import resource, sys
+import jax, jax.numpy as jnp
+from lala_jax import compiling
+if sys.argv[1] == "keep":
+    compiling.keep_memory()
+program = jax.jit(lambda x: jnp.sort(jnp.sort(x) * x).sum())
+x = jnp.ones(4_000_000)
+def faults():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    program(x).block_until_ready()
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+print(sum([faults() for _ in range(8)][3:]))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the memory of Linux with glibc")
+def test_memory_is_not_asked_for_again():
+    """Of the pages that a program with several pieces of 16 MB asks for; who says what malloc is to do is left alone."""
+
+    def pages(*arguments, **environment):
+        command = [sys.executable, "-c", FAULTS, *arguments]
+        return int(subprocess.run(command, capture_output=True, text=True, check=True, env={**os.environ, **environment}).stdout)
+
+    asked = pages("ask")
+    assert asked > 5 * 16_000_000 / resource.getpagesize() and 3 * pages("keep") < asked
+    assert 3 * pages("keep", MALLOC_MMAP_THRESHOLD_="65536") > asked
 
 
 def test_donated_memory_is_counted_once_and_static_arguments_are_left_out():
