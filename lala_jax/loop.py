@@ -114,7 +114,7 @@ def run(
     leave, says whether it did anything, the time of which is then not the steps'. Of several processes all run the loop, and leave it at
     the step at which one is `stopped()`; a process without a `writer` says nothing.
     """
-    seen, begin = [], time.time()
+    seen, begin, setup = [], time.time(), 0.0
     columns = (*progress.Progress.get_default_columns(), progress.MofNCompleteColumn(), progress.TextColumn("{task.fields[note]}"))
     with progress.Progress(*columns, speed_estimate_period=600, disable=writer is None) as bar:
         plain = not bar.console.is_terminal  # a log file gets a line now and then instead of a bar
@@ -122,8 +122,10 @@ def run(
         shown = bar.add_task("training", total=total, completed=first - 1, note="compiling")
         step = None
         for number in range(first, total + 1):
-            step = step or prepare(current)
             start = time.time()
+            if step is None:
+                step = prepare(current)
+                setup, start = time.time() - start, time.time()
             current, metrics = step(current)
             seen.append(metrics)
             if number <= first + 1:  # the second one says how long they take: the first may have had something to set up
@@ -132,13 +134,15 @@ def run(
                 print(estimate(total - number, time.time() - start), flush=True)
             if number % log_every == 0 or number == total:
                 values = mean_metrics(seen, last=number)
-                values["seconds_per_step"], seen, begin = (time.time() - begin) / len(seen), [], time.time()
+                took, count, seen, begin = time.time() - begin, len(seen), [], time.time()
+                values["seconds_per_step"] = took / count
                 bar.update(shown, note=note(values))
                 if writer is not None:
                     writer.scalars(number, values)
                 if writer is not None and plain:
-                    left = (total - number) * values["seconds_per_step"] / 60
+                    left = (total - number) * (took - setup) / count / 60
                     print(f"step {number} of {total}: {note(values)}; {left:.0f} minutes left", flush=True)
+                setup = 0.0
             bar.update(shown, completed=number)
             leaving = parallel.anywhere(stopped())
             if number % save_every == 0 or number == total or leaving:

@@ -91,6 +91,24 @@ def test_what_is_left_is_told_after_two_steps(tmp_path, capsys, monkeypatch):
     assert "about 5.56 hours" in loop.estimate(20_000, 1.0)
 
 
+def test_compiling_is_not_taken_for_the_pace(tmp_path, capsys, monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(loop, "time", types.SimpleNamespace(time=lambda: now[0]))
+
+    class Slow(list):
+        def append(self, number):
+            now[0] += 6000.0
+
+    def wait(number, run):
+        now[0] += 60.0  # before the next step
+        return False
+
+    go(tmp_path, 6, prepared=Slow(), after=wait)
+    assert re.findall(r"step (\d) .*; (\d+) minutes left", capsys.readouterr().out) == [("2", "2"), ("4", "2"), ("6", "0")]
+    rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert [row["seconds_per_step"] for row in rows] == [3030.0, 60.0, 60.0]
+
+
 def test_a_compiled_step_is_one_program_that_says_what_it_needs(capsys):
     traced = []
 
