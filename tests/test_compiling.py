@@ -85,6 +85,24 @@ def test_donated_memory_is_counted_once_and_static_arguments_are_left_out():
     assert float(program(x)[0]) == 3.0 and x.is_deleted()
 
 
+def test_a_large_program_takes_less_memory_on_a_cpu(monkeypatch):
+    """Here eight branches that could run at once."""
+
+    def loss(weights, x):
+        hidden = [jnp.tanh(x @ w) for w in weights]
+        return sum((y @ w.T).sum() for y, w in zip(hidden, weights, strict=True))
+
+    weights, x = jnp.ones((8, 64, 512)), jnp.ones((512, 64))
+    found = []
+    for platform, limit in (("cpu", 1 << 30), ("cpu", 1 << 20), ("tpu", 1 << 20)):
+        monkeypatch.setattr(compiling, "LARGE", limit)
+        monkeypatch.setattr(jax, "default_backend", lambda platform=platform: platform)
+        program, facts = compiling.build(compiling.jit(loss), weights, x)
+        found.append((facts["memory"], float(program(weights, x))))
+    (plain, value), (lean, same), other = found
+    assert lean < 0.5 * plain and same == pytest.approx(value, rel=1e-5) and other == (plain, value)
+
+
 def _conv(strides, padding, rhs_dilation=(1, 1)):
     def run(image, kernel):
         how = {"rhs_dilation": rhs_dilation, "dimension_numbers": ("NHWC", "HWIO", "NHWC")}
