@@ -1,4 +1,4 @@
-"""How the programs with a network in them are compiled, what they need, and where they are kept for the next process."""
+"""How the programs with a network in them are compiled, what they need, and what is kept: programs for the next process, memory here."""
 
 from __future__ import annotations
 
