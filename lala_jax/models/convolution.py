@@ -19,9 +19,9 @@ def blocked(lhs: jax.Array, rhs: jax.Array, window_strides: Sequence[int], paddi
     Raises ValueError unless the padding is "SAME", the strides divide the sides and nothing is dilated or grouped.
     """
     batch, *sides, channels = lhs.shape
-    kwargs = _plain(kwargs)
-    if padding != "SAME":
-        raise ValueError(f"needs padding SAME, got padding {padding!r}")
+    kwargs, odd = _plain(kwargs)
+    if padding != "SAME" or odd:
+        raise ValueError(f"needs padding SAME without dilation or groups, got padding {padding!r} and {odd or 'neither'}")
     if any(side % step for side, step in zip(sides, window_strides, strict=True)):
         raise ValueError(f"strides {tuple(window_strides)} must divide the sides {tuple(sides)}")
     pads, room, blocks = [], [], []
@@ -49,9 +49,11 @@ def pointwise(
     Maps `lhs` `[B, H, W, C]` and `rhs` `[1, 1, C, O]` to `[B, H / sh, W / sw, O]`, rounded up. On a GPU XLA fuses a product with what is
     around it, and hands a convolution to a library. Raises ValueError for a larger kernel, padding, dilation or groups.
     """
-    kwargs = _plain(kwargs)
-    if rhs.shape[:2] != (1, 1) or any(pair != (0, 0) for pair in padding):
-        raise ValueError(f"needs a kernel of 1x1 without padding, got {rhs.shape[:2]} and padding {padding!r}")
+    kwargs, odd = _plain(kwargs)
+    if rhs.shape[:2] != (1, 1) or any(pair != (0, 0) for pair in padding) or odd:
+        raise ValueError(
+            f"needs a kernel of 1x1 without padding, dilation or groups, got {rhs.shape[:2]}, padding {padding!r} and {odd or 'neither'}"
+        )
     down, right = window_strides
     return jnp.matmul(lhs[:, ::down, ::right], rhs[0, 0], precision=kwargs.get("precision"))
 
@@ -67,9 +69,9 @@ def narrowing(
 
     Raises ValueError for strides, dilation or groups. There is no derivative in forward mode.
     """
-    kwargs = _plain(kwargs)
-    if any(step != 1 for step in window_strides):
-        raise ValueError(f"needs strides of 1, got {tuple(window_strides)}")
+    kwargs, odd = _plain(kwargs)
+    if any(step != 1 for step in window_strides) or odd:
+        raise ValueError(f"needs strides of 1 without dilation or groups, got {odd or tuple(window_strides)}")
 
     def plain(lhs: jax.Array, rhs: jax.Array) -> jax.Array:
         return jax.lax.conv_general_dilated(lhs, rhs, (1, 1), padding, **kwargs)
@@ -88,11 +90,10 @@ def narrowing(
     return convolve(lhs, rhs)
 
 
-def _plain(kwargs: Mapping[str, Any]) -> dict[str, Any]:
-    """Take from a convolution's arguments what says that it is neither dilated nor grouped; raises ValueError where it is."""
+def _plain(kwargs: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
+    """Give a convolution's arguments without those of dilation and groups, and what these ask for, "" for neither."""
     rest = dict(kwargs)
-    dilated = [name for name in ("lhs_dilation", "rhs_dilation") if any(step != 1 for step in rest.pop(name, None) or ())]
-    groups = rest.pop("feature_group_count", 1)
-    if dilated or groups != 1:
-        raise ValueError(f"needs a convolution without dilation or groups, got {dilated or f'{groups} groups'}")
-    return rest
+    odd = [name for name in ("lhs_dilation", "rhs_dilation") if any(step != 1 for step in rest.pop(name, None) or ())]
+    if (groups := rest.pop("feature_group_count", 1)) != 1:
+        odd.append(f"{groups} groups")
+    return rest, ", ".join(odd)

@@ -62,7 +62,8 @@ def rotate_crop(
 
     Crop `b` is what the picture of an object held at `center` looks like after a right-handed turn of `2 pi b / k` about world z.
     The centre lands on the centre of crop cell `[size // 2, size // 2]`: give `(i + 0.5, j + 0.5)` to turn about
-    cell `[i, j]`. Bilinear, zero outside the image.
+    cell `[i, j]`. Bilinear, zero outside the image. Reads all crops at once: of the default agent's few channels that is a tenth of a
+    training step faster on a CPU than one after the other, which `transporter.pick_crops` is for.
     """
     offsets = whole_turn_offsets(yaw_bins, size)
     center = jnp.broadcast_to(jnp.asarray(center, jnp.float32), offsets.shape)
