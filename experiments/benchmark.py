@@ -43,15 +43,16 @@ def main(config, workdir, *, task: str, stages: str, growth: bool, repeats: int,
     known = [name for name in every if name not in ceilings]
     wanted = [options.check_choice("--stages", name, known) for name in stages.split(",") if name] or known
     before = read(against) if against else None
+    apart = jax.default_backend() == "cpu"  # a GPU's memory is one process's, and nothing that others leave slows it
     rows = []
     for name in (*ceilings, *wanted):
         print(f"{name}: {every[name].label}", flush=True)
-        rows.append(timing.timed(name, every, config, repeats))
+        rows.append(timing.timed(name, every, config, repeats, apart=apart))
         print(f"  {cost(rows[-1])}", flush=True)
     peaks = {field: next(row for row in rows if row["name"] == name)[f"{field}_per_second"] for name, field in ceilings.items()}
     for row in rows:
         row["share"] = {field: row[f"{field}_per_second"] / peak for field, peak in peaks.items() if f"{field}_per_second" in row}
-    grown = [benchmark_stages.grow(name, config, repeats) for name in benchmark_stages.GROWTH] if growth else []
+    grown = [benchmark_stages.grow(name, config, repeats, apart=apart) for name in benchmark_stages.GROWTH] if growth else []
     targets = [benchmark_targets.judged(target, rows, task, jax.default_backend()) for target in benchmark_targets.TARGETS]
     result = {"task": task, **machine(), "stages": rows, "growth": grown, "targets": targets}
     kind = "".join(letter if letter.isalnum() else "-" for letter in result["device"].lower())
@@ -83,7 +84,12 @@ def machine() -> dict[str, Any]:
 def cost(row: Mapping[str, Any]) -> str:
     """Write a row's median, or why there is none."""
     one = "an" if row["unit"][0] in "aeiou" else "a"
-    return row.get("unavailable") or f"{benchmark_targets.seconds_text(row['seconds'])} {one} {row['unit']}"
+    return row.get("unavailable") or f"{median(row)} {one} {row['unit']}"
+
+
+def median(row: Mapping[str, Any]) -> str:
+    """Write a row's median alone, or why there is none."""
+    return row.get("unavailable") or benchmark_targets.seconds_text(row["seconds"])
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -103,11 +109,8 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
 
 def growth_table(grown: Sequence[Mapping[str, Any]]) -> str:
     """Write what grows as a Markdown table."""
-    lines = [
-        [one["label"], ", ".join(f"{row['value']}: {benchmark_targets.seconds_text(row['seconds'])}" for row in one["rows"])]
-        for one in grown
-    ]
-    return common.table(["", "seconds"], lines)
+    lines = [[one["label"], ", ".join(f"{row['value']}: {median(row)}" for row in one["rows"])] for one in grown]
+    return common.table(["", "time"], lines)
 
 
 def read(path: str) -> dict[str, Any]:

@@ -409,14 +409,14 @@ def some_views(config, count: int) -> timing.Work:
     return timing.compiled(maps, *(leaf[0] for leaf in (drawn.size, drawn.color, drawn.base, poses)))
 
 
-def with_cells(config, rows: int) -> timing.Work:
-    """Fuse to a map of `rows` rows and half as many columns."""
-    return fuse(resized(config, **{"map.cell": 1.0 / rows}))
+def with_cells(config, count: int) -> timing.Work:
+    """Fuse to a map of `count` rows and half as many columns."""
+    return fuse(resized(config, **{"map.cell": 1.0 / count}))
 
 
-def with_batch(config, batch: int) -> timing.Work:
+def with_batch(config, count: int) -> timing.Work:
     """Take training steps of another batch size."""
-    return training_step(resized(config, **{"train.batch_size": batch}))
+    return training_step(resized(config, **{"train.batch_size": count}))
 
 
 def with_episodes(config, count: int) -> timing.Work:
@@ -444,14 +444,24 @@ GROWTH = {
 }
 
 
-def grow(name: str, config, repeats: int) -> dict[str, Any]:
-    """Time one thing at several sizes."""
-    label, values, prepare = GROWTH[name]
+def served() -> dict[str, timing.Stage]:
+    """Give every stage by its name, and each size of what grows by `NAME=SIZE`."""
+    grown = {
+        f"{name}={value}": timing.Stage(label, "thing", functools.partial(prepare, count=value))
+        for name, (label, values, prepare) in GROWTH.items()
+        for value in values
+    }
+    return {**STAGES, **grown}
+
+
+def grow(name: str, config, repeats: int, *, apart: bool = False) -> dict[str, Any]:
+    """Time one thing at several sizes; `apart` as in `timing.timed`."""
+    label, values, _ = GROWTH[name]
     print(f"{name}: {label}", flush=True)
-    rows = [{"value": value, **timing.measured(prepare(config, value), repeats)} for value in values]
+    rows = [{"value": value, **timing.timed(f"{name}={value}", served(), config, repeats, apart=apart)} for value in values]
     return {"name": name, "label": label, "rows": rows}
 
 
 if __name__ == "__main__":
     compiling.keep_memory()
-    timing.serve(STAGES)
+    timing.serve(served())

@@ -47,7 +47,7 @@ class Stage:
     label: str
     unit: str
     prepare: Callable[[Any], Work]
-    alone: bool = False  # in a process of its own, which may be slow or run out of memory
+    alone: bool = False  # in a process of its own on any machine; it may be slow or run out of memory
     needs: tuple[str, ...] = ()  # modules that such a process imports first
     environment: Mapping[str, str] = dataclasses.field(default_factory=dict)  # of such a process, where the user's does not say
     platform: str = ""  # the only one of JAX's that it is for
@@ -101,14 +101,18 @@ def compilations() -> list[str]:
     return names
 
 
-def timed(name: str, stages: Mapping[str, Stage], config, repeats: int) -> dict[str, Any]:
-    """Time a stage: a row with the median and the extremes of a thing in seconds; or why it could not run."""
+def timed(name: str, stages: Mapping[str, Stage], config, repeats: int, *, apart: bool = False) -> dict[str, Any]:
+    """Time a stage: a row with the median and the extremes of a thing in seconds; or why it could not run.
+
+    With `apart` every stage has a process of its own: what others left behind in this one's memory slows what is measured here by up to a
+    half on a CPU.
+    """
     stage = stages[name]
     row = {"name": name, "label": stage.label, "unit": stage.unit}
     try:
         if stage.platform not in ("", jax.default_backend()):
             raise Unavailable(f"needs a {stage.platform.upper()}")
-        if stage.alone:
+        if stage.alone or apart:
             return row | alone(name, stage, config, repeats)
         return row | measured(stage.prepare(config), repeats) | device_memory()
     except Unavailable as error:
@@ -125,7 +129,7 @@ def device_memory() -> dict[str, float]:
 
 
 def alone(name: str, stage: Stage, config, repeats: int) -> dict[str, Any]:
-    """Time a stage of `benchmark_stages` in a new process, which `serve`s it; raises Unavailable where it fails or takes over LIMIT."""
+    """Time a stage of `benchmark_stages.served` in a new process, which `serve`s it; raises Unavailable if it fails or takes over LIMIT."""
     request = json.dumps({"name": name, "config": options.to_dict(config), "repeats": repeats})
     command = [sys.executable, "-m", "experiments.benchmark_stages"]
     try:
@@ -147,7 +151,7 @@ def serve(stages: Mapping[str, Stage]) -> None:
     """Time the stage that standard input asks for, and write its row as the last line of standard output.
 
     On Linux `process_memory` is the most that running it took, in bytes, over what the process took once the modules were imported;
-    compiling is not in it, but for what it left.
+    compiling is not in it, but for what it left. Where it starts processes, it is what the largest of them took.
     """
     request = json.load(sys.stdin)
     stage, config = stages[request["name"]], options.from_dict(request["config"])
@@ -162,7 +166,10 @@ def serve(stages: Mapping[str, Stage]) -> None:
         forget_peak()
         row = measured(work, request["repeats"])
         if before is not None:
-            row["process_memory"] = memory("VmHWM") - before
+            import resource  # Unix only
+
+            children = 1024.0 * resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+            row["process_memory"] = max(memory("VmHWM") - before, children)
         row |= device_memory()
     except Unavailable as error:
         row = {"unavailable": str(error)}

@@ -81,12 +81,25 @@ def test_a_process_of_its_own(monkeypatch):
     config, stage = tiny_config(), benchmark_stages.STAGES["import"]
     row = timing.alone("import", stage, config, 1)
     assert row["seconds"] > 0 and row["runs"] == 1
-    assert sys.platform != "linux" or 0 < row["process_memory"] < 1 << 28
+    assert sys.platform != "linux" or 4e6 < row["process_memory"] < 1 << 28  # a Python, which the stage starts
+    grown = timing.alone("boxes=2", stage, small(config), 1)
+    assert grown["seconds"] > 0 and grown["count"] == 1
     with pytest.raises(timing.Unavailable, match="ended with status 1: KeyError: 'no-such'"):
         timing.alone("no-such", stage, config, 1)
     monkeypatch.setattr(timing, "LIMIT", 0.01)
     with pytest.raises(timing.Unavailable, match="not done after 0 s"):
         timing.alone("import", stage, config, 1)
+
+
+def test_a_stage_runs_apart_from_the_others_where_it_is_asked_for(monkeypatch):
+    monkeypatch.setattr(timing, "alone", lambda name, stage, config, repeats: {"seconds": 3.0, "alone": name})
+    stages = {"a": timing.Stage("a thing", "thing", lambda config: timing.Work(lambda: None))}
+    assert timing.timed("a", stages, None, 1, apart=True)["alone"] == "a" and "alone" not in timing.timed("a", stages, None, 1)
+    elsewhere = {"a": timing.Stage("a thing", "thing", pytest.fail, platform="tpu")}
+    assert timing.timed("a", elsewhere, None, 1, apart=True)["unavailable"] == "needs a TPU"
+    monkeypatch.setattr(timing, "alone", lambda name, *_: {"seconds": 1.0, "name": name})
+    found = benchmark_stages.grow("cells", None, 1, apart=True)
+    assert [row["name"] for row in found["rows"]] == ["cells=80", "cells=160", "cells=320", "cells=640"]
 
 
 def test_what_is_not_installed_is_named(monkeypatch, capsys):
@@ -213,6 +226,8 @@ def test_what_grows(name, monkeypatch):
     found = benchmark_stages.grow(name, small(tiny_config()), repeats=1)
     assert [row["value"] for row in found["rows"]] == list(values[:2]) and all(row["seconds"] > 0 for row in found["rows"])
     assert f"{values[0]}: " in benchmark.growth_table([found])
+    gone = {**found, "rows": [*found["rows"][:1], {"value": 7, "unavailable": "not done after 900 s"}]}
+    assert benchmark.growth_table([gone]).endswith(", 7: not done after 900 s |")
 
 
 def test_every_one_of_many_boxes_is_drawn(monkeypatch):
@@ -232,7 +247,8 @@ def test_two_files_are_compared_by_ratio(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(benchmark_stages, "STAGES", {**ceilings, **stages})
     rates = {"flops_per_second": 1e9, "bytes_per_second": 1e9}
 
-    def timed(name, stages, config, repeats):
+    def timed(name, stages, config, repeats, *, apart):
+        assert apart == (jax.default_backend() == "cpu")
         row = {"name": name, "label": stages[name].label, "unit": stages[name].unit, "runs": repeats, "recompiled": 0}
         if name == "b" and taken["b"] is None:
             return {**row, "unavailable": "no b here"}
