@@ -57,6 +57,9 @@ class Task:
 
     def __call__(self) -> Any:
         """Do the task in a worker, unless it is done by now, and keep the result."""
+        from lala_jax import compiling  # imports JAX, which nobody else needs here
+
+        compiling.keep()
         try:
             if self.part is None:
                 return self.call()

@@ -41,6 +41,14 @@ def stopped(path, value):
     return value
 
 
+def programs(path):
+    """Give the folder in which this process keeps compiled programs."""
+    import jax
+
+    note(path)
+    return jax.config.jax_compilation_cache_dir
+
+
 def hold(path):
     """Hold a lock for as long as the process lives."""
     with cluster.exclusive(pathlib.Path(path)):

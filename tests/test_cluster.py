@@ -137,6 +137,13 @@ def test_workers_see_the_accelerators_of_the_command(seen, local, tmp_path, monk
     assert found == {"CUDA_VISIBLE_DEVICES": seen, "JAX_PLATFORMS": os.environ.get("JAX_PLATFORMS")}
 
 
+def test_workers_keep_programs_as_commands_do(local, tmp_path, monkeypatch):
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    found = dict(cluster.run(local, [task(tmp_path, "here", cluster_tasks.programs)], tmp_path / "parts"))
+    assert found == {"here": str(tmp_path / "lala_jax" / "xla")}
+
+
 def test_who_leaves_early_takes_the_workers_along(local, tmp_path):
     signal.signal(signal.SIGINT, signal.default_int_handler)  # where it is ignored, workers would ignore it, too
     found = cluster.run(local, [task(tmp_path, "slow", cluster_tasks.ran, wait=600.0), task(tmp_path, "fast")], tmp_path / "parts")
