@@ -24,6 +24,7 @@ from lala_jax.perception import topdown
 from lala_jax.sim import oracle, physics, render, robot, scene
 
 BATCH = 8  # observations at a time, where a stage takes several
+EPISODES = 100  # of a closed loop
 FULL = {"camera.height": 480, "camera.width": 640}  # the cameras' own resolution
 EGL = {"MUJOCO_GL": "egl"} if sys.platform == "linux" else {}  # renders without a display
 
@@ -267,17 +268,17 @@ def collection(config) -> timing.Work:
     return timing.Work(lambda: recording.demonstrate(task, seeds, threads=config.data.threads), made)
 
 
-def evaluation(config, *, parallel: int = 25) -> timing.Work:
-    """Run the closed loop with the weights that ship."""
+def evaluation(config) -> timing.Work:
+    """Run the closed loop with the weights that ship, a quarter of EPISODES at once."""
     path = f"pretrained/{config.task.name}"
     agent, observer = build.build_policy(config), build.observer(config)
     params = scoring.check_checkpoint(path, config, agent)
-    seeds = build.split_seeds("val", 0, parallel)
+    seeds, parallel = build.split_seeds("val", 0, EPISODES), max(EPISODES // 4, 1)
 
     def run():
         scoring.evaluate(agent, params, observer, seeds=seeds, parallel=parallel, threads=config.data.threads)
 
-    return timing.Work(run, parallel)
+    return timing.Work(run, EPISODES)
 
 
 def trained_state(config) -> tuple[state.TrainState, dict[str, Any]]:
@@ -368,7 +369,7 @@ STAGES = {
     "train-paper-torch": timing.Stage("that with PyTorch", "sample", paper_torch, alone=True, needs=("torch",)),
     "primitive": timing.Stage("one action of the arm", "action", primitive),
     "collect": timing.Stage("demonstrations", "demonstration", collection),
-    "evaluate": timing.Stage("closed loop", "episode", evaluation),
+    "evaluate": timing.Stage("closed loop, 100 episodes and compiling", "episode", evaluation),
     "save": timing.Stage("save a checkpoint", "checkpoint", save),
     "restore": timing.Stage("restore a checkpoint", "checkpoint", restore),
 }

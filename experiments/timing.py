@@ -20,7 +20,8 @@ import numpy as np
 
 from lala_jax import compiling, options
 
-SECONDS = 20.0  # after so long a stage is not repeated again
+WARM, SECONDS = 5.0, 20.0  # after so long a stage is warm, and is not repeated again
+ONCE = 60.0  # seconds of a first run that stays the only one
 LIMIT = 900.0  # seconds that a process of its own may take
 COMPILED = "/jax/core/compile/backend_compile_duration"  # what JAX says when it has compiled a program, or read a kept one
 STATUS = pathlib.Path("/proc/self/status")  # where Linux says how much memory a process takes, and how much it took at most
@@ -72,18 +73,27 @@ def stepping(step, run: Any, *inputs: Any, count: int = 1) -> Work:
 
 
 def measured(work: Work, repeats: int) -> dict[str, Any]:
-    """Run some work once to warm up and then up to `repeats` times: seconds a thing, and rates; a warm-up of over SECONDS stays alone."""
-    runs, begin = [], time.perf_counter()
-    with contextlib.closing(work):
+    """Run some work up to `repeats` times, for SECONDS, after as many to warm up, for WARM: seconds a thing, and rates.
+
+    One run is not enough to warm up: it may be the fifth that finds all its memory kept. A first run of over ONCE is the only one.
+    """
+
+    def clocked() -> float:
+        start = time.perf_counter()
         work.run()
+        return time.perf_counter() - start
+
+    with contextlib.closing(work):
+        begin, first = time.perf_counter(), clocked()
         before = len(compilations())
-        if (first := time.perf_counter() - begin) > SECONDS:
-            runs.append(first / work.count)
-        begin = time.perf_counter()
-        while first <= SECONDS and len(runs) < repeats and (not runs or time.perf_counter() - begin < SECONDS):
-            start = time.perf_counter()
-            work.run()
-            runs.append((time.perf_counter() - start) / work.count)
+        for _ in range(1, repeats):
+            if time.perf_counter() - begin > WARM:
+                break
+            clocked()
+        runs, begin = [first] if first > ONCE else [], time.perf_counter()
+        while first <= ONCE and len(runs) < repeats and (not runs or time.perf_counter() - begin < SECONDS):
+            runs.append(clocked())
+    runs = [seconds / work.count for seconds in runs]
     again = len(compilations()) - before
     seconds = float(np.median(runs))
     rates = {f"{name}_per_second": work.facts[name] / work.count / seconds for name in ("flops", "bytes") if name in work.facts}

@@ -27,7 +27,7 @@ def clock(monkeypatch):
 
 
 def test_medians_and_rates_are_of_one_thing(clock):
-    taken = iter([15.0, 1.0, 4.0, 2.0, 9.0])  # the first run warms up
+    taken = iter([3.0, 1.0, 1.0, 1.0, 4.0, 2.0, 9.0])  # the first three runs warm up
 
     def run():
         clock[0] += next(taken)
@@ -37,7 +37,7 @@ def test_medians_and_rates_are_of_one_thing(clock):
     assert found["flops_per_second"] == 15.0 and found["memory"] == 7.0 and "bytes_per_second" not in found
 
 
-@pytest.mark.parametrize("seconds, runs, calls", [(15.0, 2, 3), (30.0, 1, 1)])
+@pytest.mark.parametrize("seconds, runs, calls", [(3.0, 7, 9), (15.0, 2, 3), (30.0, 1, 2), (70.0, 1, 1)])
 def test_what_is_slow_is_not_repeated(clock, seconds, runs, calls):
     called = []
 
@@ -73,7 +73,7 @@ def test_each_run_of_steps_goes_on_from_the_last():
 def test_what_is_compiled_again_is_counted():
     sizes, jitted = itertools.count(10), jax.jit(lambda x: x * 2)
     assert timing.measured(timing.Work(lambda: jitted(np.zeros(3))), 2)["recompiled"] == 0
-    assert timing.measured(timing.Work(lambda: jitted(np.zeros(next(sizes)))), 2)["recompiled"] == 2
+    assert timing.measured(timing.Work(lambda: jitted(np.zeros(next(sizes)))), 2)["recompiled"] == 3
 
 
 def test_a_process_of_its_own(monkeypatch):
@@ -180,6 +180,7 @@ NAMES = [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name fo
 def test_every_stage_runs(name, monkeypatch):
     monkeypatch.setattr(benchmark_stages, "FULL", {})
     monkeypatch.setattr(benchmark_stages, "BATCH", 2)
+    monkeypatch.setattr(benchmark_stages, "EPISODES", 4)
     monkeypatch.setattr(benchmark_stages.recording, "SHARD", 1)
     config = tiny_config()
     params = jax.eval_shape(build.build_policy(config).init, jax.random.key(0))
