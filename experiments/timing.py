@@ -161,7 +161,7 @@ def serve(stages: Mapping[str, Stage]) -> None:
     """Time the stage that standard input asks for, and write its row as the last line of standard output.
 
     On Linux `process_memory` is the most that running it took, in bytes, over what the process took once the modules were imported;
-    compiling is not in it, but for what it left. Where it starts processes, it is what the largest of them took.
+    compiling is not in it, but for what it left. Nothing is told of what starts processes: theirs is not known.
     """
     request = json.load(sys.stdin)
     stage, config = stages[request["name"]], options.from_dict(request["config"])
@@ -174,13 +174,10 @@ def serve(stages: Mapping[str, Stage]) -> None:
         before = memory("VmRSS")
         work = stage.prepare(config)
         forget_peak()
-        row = measured(work, request["repeats"])
-        if before is not None:
-            import resource  # Unix only
-
-            children = 1024.0 * resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
-            row["process_memory"] = max(memory("VmHWM") - before, children)
-        row |= device_memory()
+        others = None if before is None else faults_of_children()
+        row = measured(work, request["repeats"]) | device_memory()
+        if before is not None and faults_of_children() == others:
+            row["process_memory"] = memory("VmHWM") - before
     except Unavailable as error:
         row = {"unavailable": str(error)}
     print(f"\n{json.dumps(row)}", flush=True)
@@ -191,6 +188,13 @@ def memory(field: str) -> float | None:
     if not STATUS.exists():
         return None
     return 1024.0 * next(int(line.split()[1]) for line in STATUS.read_text().splitlines() if line.startswith(f"{field}:"))
+
+
+def faults_of_children() -> int:
+    """Count the pages that processes which this one started and waited for have asked for: more after one of them; on Unix."""
+    import resource
+
+    return resource.getrusage(resource.RUSAGE_CHILDREN).ru_minflt
 
 
 def forget_peak() -> None:
