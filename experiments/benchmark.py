@@ -43,7 +43,7 @@ def main(config, workdir, *, task: str, stages: str, growth: bool, repeats: int,
     known = [name for name in every if name not in ceilings]
     wanted = [options.check_choice("--stages", name, known) for name in stages.split(",") if name] or known
     before = read(against) if against else None
-    apart = jax.default_backend() == "cpu"  # a GPU's memory is one process's, and nothing that others leave slows it
+    apart = jax.default_backend() == "cpu"  # a GPU's memory is this process's
     rows = []
     for name in (*ceilings, *wanted):
         print(f"{name}: {every[name].label}", flush=True)

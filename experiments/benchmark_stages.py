@@ -457,9 +457,9 @@ def served() -> dict[str, timing.Stage]:
 
 def grow(name: str, config, repeats: int, *, apart: bool = False) -> dict[str, Any]:
     """Time one thing at several sizes; `apart` as in `timing.timed`."""
-    label, values, _ = GROWTH[name]
+    (label, values, _), stages = GROWTH[name], served()
     print(f"{name}: {label}", flush=True)
-    rows = [{"value": value, **timing.timed(f"{name}={value}", served(), config, repeats, apart=apart)} for value in values]
+    rows = [{"value": value, **timing.timed(f"{name}={value}", stages, config, repeats, apart=apart)} for value in values]
     return {"name": name, "label": label, "rows": rows}
 
 

@@ -114,8 +114,8 @@ def compilations() -> list[str]:
 def timed(name: str, stages: Mapping[str, Stage], config, repeats: int, *, apart: bool = False) -> dict[str, Any]:
     """Time a stage: a row with the median and the extremes of a thing in seconds; or why it could not run.
 
-    With `apart` every stage has a process of its own: what others left behind in this one's memory slows what is measured here by up to a
-    half on a CPU.
+    With `apart` every stage has a process of its own, as a command has: what others left in memory is not in its way, and its own use of
+    memory can be told.
     """
     stage = stages[name]
     row = {"name": name, "label": stage.label, "unit": stage.unit}
