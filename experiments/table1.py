@@ -4,7 +4,7 @@ Trains every row of `ROWS` on the same demonstrations with the same number of sa
 writes `<scale>-<task>.json` (see `common`; a row has `published`, the paper's number or null, `parameters`, `samples` and `train_seconds`
 besides), `<scale>.md`, a table of both tasks as far as they are there, and `<scale>.webp`, the same as bars, to `--out`. The scales are
 `smoke` (every part, scores that mean nothing), `cpu` (the paper's pictures, maps, crops and widths divided by four, so that a row trains
-in half an hour on two cores) and `paper` (its own sizes and optimiser; for a GPU).
+in half an hour on two cores) and `paper` (its own sizes, optimiser and number of samples, in bfloat16; for a GPU).
 Runs lie in `--workdir`, runs/table1/<task> unless told, each in <scale>-<row>. Started again, it goes on with the rows that are
 missing, and within a row where its training stopped; `--rows=two-stream,ours` runs only these (and the first). The row `cliport-clip`
 needs CLIP's own weights: `--clip=RN50.safetensors --clip-tokenizer=tokenizer.json`, which `clip_file` reads. With `--launcher=slurm` or
@@ -102,7 +102,7 @@ SCALES = {
         *("pretrain.steps=2", "pretrain.scenes=2", "pretrain.batch_size=2", "pretrain.window=32"),
     ),
     "cpu": ("data.demos=500", "train.steps=400", "train.batch_size=8", "eval.episodes=100"),
-    "paper": ("data.demos=500", "camera.height=480", "camera.width=640", "eval.episodes=100", "eval.parallel=4"),
+    "paper": ("data.demos=500", "camera.height=480", "camera.width=640", "train.save_every=1000", "eval.episodes=100", "eval.parallel=4"),
 }
 FEW = {"smoke": 2, "cpu": 50, "paper": 50}
 QUARTER = ("camera.height=120", "camera.width=160", "map.cell=0.0125")
@@ -110,8 +110,9 @@ PAPER = {
     "smoke": ("model.width=4", "model.stages=2", "camera.stage=stem"),
     "cpu": (*QUARTER, "model.crop=16", "model.width=16", "pretrain.window=32", "pretrain.patch=4"),
     "paper": (
-        *("map.cell=0.003125", "model.crop=64", "model.channels=3", "model.width=64", "train.steps=20000", "train.batch_size=1"),
-        *("optim.schedule=constant", "optim.learning_rate=1e-4", "optim.weight_decay=0.0"),
+        *("map.cell=0.003125", "model.crop=64", "model.channels=3", "model.width=64", "model.dtype=bfloat16"),
+        # The paper's 20 000 samples, eight at a time, and for that the root of eight times its learning rate of 1e-4.
+        *("train.steps=2500", "train.batch_size=8", "optim.schedule=constant", "optim.learning_rate=2.83e-4", "optim.weight_decay=0.0"),
     ),
 }
 OURS = {
@@ -211,7 +212,9 @@ def run(row: Entry, base, directory: pathlib.Path, seeds: Sequence[int]) -> dict
     if row.agent != "policy":
         summary = scoring.baseline(row.agent, build.task(config), seeds=seeds, threads=config.data.threads)
         return {**common.row_of(summary), "parameters": None, "samples": 0, "train_seconds": 0.0}
-    config = options.override(config, [f"train.eval_every={config.train.steps}", "train.eval_episodes=1", "eval.strips=0"])
+    # One validation, of a few episodes: at the paper's scale as many as the scores then take at once, by the same program.
+    last = f"train.eval_every={config.train.steps}", f"train.eval_episodes={min(config.eval.parallel, 4)}"
+    config = options.override(config, [*last, "eval.strips=0"])
     if row.scene:
         config.camera.backbone = backbone(config, directory.with_name(directory.name.removesuffix(row.name) + "backbone"))
     params = jax.eval_shape(build.build_policy(config).init, jax.random.key(0))

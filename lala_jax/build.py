@@ -89,7 +89,7 @@ def observer(config: Mapping[str, Any]) -> observe.Observer:
     for name in ("height", "width"):
         _positive(f"camera.{name}", fields[name])
     surface(config)
-    built = observe.Observer(task=task(config), spec=map_spec(config), **fields)
+    built = observe.Observer(task=task(config), spec=map_spec(config), dtype=network_dtype(config), **fields)
     options.check_choice("camera.missing", built.missing, range(-1, len(built.camera.intrinsics)))
     built.check()
     return built
@@ -104,6 +104,11 @@ def surface(config: Mapping[str, Any]) -> int:
     return 64 if stage == "stem" else resnet.layers(stage)[f"{stage}_1/expand"][-1]
 
 
+def network_dtype(config: Mapping[str, Any]) -> str:
+    """Give the type that networks compute in, the backbone among them."""
+    return options.check_choice("model.dtype", config["model"].get("dtype", NEWER["model.dtype"]), DTYPES)
+
+
 def build_policy(config: Mapping[str, Any]) -> policy.Policy:
     """Build the policy from the groups `model` and `map`."""
     fields, spec = config["model"], map_spec(config)
@@ -115,7 +120,7 @@ def build_policy(config: Mapping[str, Any]) -> policy.Policy:
     if surface(config) and fields["name"] not in transporter.VARIANTS:
         known = ", ".join(transporter.VARIANTS)
         raise options.OptionsError(f"model.name {fields['name']!r} takes no camera.backbone; those that do are {known}")
-    dtype = options.check_choice("model.dtype", fields.get("dtype", NEWER["model.dtype"]), DTYPES)
+    dtype = network_dtype(config)
     if dtype != "float32" and fields["name"] in ("goal_aware", "graph"):
         raise options.OptionsError(f"model.name {fields['name']!r} computes in float32 only, got model.dtype={dtype!r}")
     if fields["name"] == "goal_aware":

@@ -54,7 +54,7 @@ def get(arg: str, *, task: str) -> ml_collections.ConfigDict:
     config.model.trunk_width = 48
     config.model.trunk_blocks = 3
     config.model.tokens = 704  # goal voxels that the pick is matched with
-    config.model.dtype = "float32"  # what the paper's networks and their rivals compute in, or bfloat16; parameters stay float32
+    config.model.dtype = "float32"  # of the paper's networks, their rivals and the backbone, or bfloat16; parameters stay float32
     config.model.multi_action = True  # supervise every right action, not one
     config.model.match_weight = 1.0
     config.model.matching = True  # tell pick and place which voxels of the two maps look alike

@@ -12,11 +12,12 @@ import jax.numpy as jnp
 from flax import struct
 
 from lala_jax import backbone, types
-from lala_jax.perception import calibration, noise, topdown
+from lala_jax.perception import batches, calibration, noise, topdown
 from lala_jax.sim import distance, render, scene
 from lala_jax.sim.tasks import base
 
 BASELINE = 0.055  # metres between the two imagers of a RealSense D415
+SCENES = 16  # whose features are computed at once, where they are: 300 MB each at 640 x 480
 
 Whole = Callable[[Callable[[jax.Array], jax.Array], jax.Array], jax.Array]
 
@@ -45,6 +46,7 @@ class Observer:
     missing: int = -1  # the camera that sees nothing, -1 for none
     backbone: str = ""  # pretrained features of the views to fuse over the surface: a name or a file for `backbone.load`; "" for none
     stage: str = "conv2"  # of the backbone
+    dtype: str = "float32"  # what the backbone computes in, and its features are kept in
 
     @property
     def camera(self) -> types.Camera:
@@ -115,14 +117,14 @@ class Observer:
         if not self.backbone:
             return maps
 
-        module, variables = _load(self.backbone, self.stage)
+        module, variables = _load(self.backbone, self.stage, self.dtype)
 
         def one(views):
             features = jnp.asarray(module.apply(variables, views.rgb))
             features *= jax.lax.rsqrt(jnp.square(features).mean(-1, keepdims=True) + 1e-6)
-            return topdown.surface_features(views, features, spec=self.spec)
+            return topdown.surface_features(views, features.astype(self.dtype), spec=self.spec)
 
-        return maps.replace(surface=jax.lax.map(one, views))
+        return maps.replace(surface=batches.each(one, views, at_once=SCENES))
 
     def mount(self, key: jax.Array, size: jax.Array, color: jax.Array, base: jax.Array, poses: jax.Array) -> Rig:
         """Put up the cameras of E episodes: move them, and calibrate them on the pictures of the first `poses` `[E, N, 7]`."""
@@ -150,7 +152,7 @@ class Observer:
         render.check_views(self.background())
 
 
-_load = functools.lru_cache(maxsize=2)(lambda name, stage: backbone.load(name, stage=stage))
+_load = functools.lru_cache(maxsize=2)(lambda name, stage, dtype: backbone.load(name, stage=stage, dtype=jnp.dtype(dtype)))
 
 
 @functools.cache

@@ -221,6 +221,17 @@ def test_pretrained_features_lie_where_they_were_seen():
     assert np.array_equal(np.abs(found.surface[1]).sum(-1) > 0, seen) and 0.3 < seen.mean()
 
 
+def test_features_in_bfloat16_are_those_of_float32():
+    exact = dataclasses.replace(TOWER, height=60, width=80, backbone="resnet50_imagenet_v1", stage="stem")
+    views = jax.jit(exact.look)(*cubes())
+    want, got = (jax.jit(one.fuse)(views).surface for one in (exact, dataclasses.replace(exact, dtype="bfloat16")))
+    assert (want.dtype, got.dtype) == (jnp.float32, jnp.bfloat16)
+    assert 0 < np.linalg.norm(got.astype(jnp.float32) - want) < 0.02 * np.linalg.norm(want)
+    config = options.override(defaults.get("", task="tower"), ["model.name=two_stream"])
+    for dtype in build.DTYPES:
+        assert build.observer(options.override(config, [f"model.dtype={dtype}"])).dtype == dtype
+
+
 def test_only_transporters_take_a_backbone():
     config = options.override(defaults.get("", task="tower"), ["camera.backbone=resnet50_imagenet_v1"])
     with pytest.raises(options.OptionsError, match="model.name 'goal_aware' takes no camera.backbone; those that do are single, "):

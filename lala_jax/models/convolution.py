@@ -41,23 +41,6 @@ def blocked(lhs: jax.Array, rhs: jax.Array, window_strides: Sequence[int], paddi
     return jax.lax.conv_general_dilated(cells, kernel, (1, 1), pads, **kwargs)
 
 
-def pointwise(
-    lhs: jax.Array, rhs: jax.Array, window_strides: Sequence[int], padding: Sequence[tuple[int, int]], **kwargs: Any
-) -> jax.Array:
-    """Take a 1x1 convolution as a matrix product.
-
-    Maps `lhs` `[B, H, W, C]` and `rhs` `[1, 1, C, O]` to `[B, H / sh, W / sw, O]`, rounded up. On a GPU XLA fuses a product with what is
-    around it, and hands a convolution to a library. Raises ValueError for a larger kernel, padding, dilation or groups.
-    """
-    kwargs, odd = _plain(kwargs)
-    if rhs.shape[:2] != (1, 1) or any(pair != (0, 0) for pair in padding) or odd:
-        raise ValueError(
-            f"needs a kernel of 1x1 without padding, dilation or groups, got {rhs.shape[:2]}, padding {padding!r} and {odd or 'neither'}"
-        )
-    down, right = window_strides
-    return jnp.matmul(lhs[:, ::down, ::right], rhs[0, 0], precision=kwargs.get("precision"))
-
-
 def narrowing(
     lhs: jax.Array, rhs: jax.Array, window_strides: Sequence[int], padding: Sequence[tuple[int, int]], **kwargs: Any
 ) -> jax.Array:

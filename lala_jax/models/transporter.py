@@ -150,7 +150,9 @@ class Transporter(nn.Module):
             key, features = self._on_map(current, goal, self.key_net, self.query_net)
             query = pick_crops(features, pick_cell + self.crop // 2, **turns)
         else:
-            maps = pick_crops(jnp.concatenate([current, goal], -1), pick_cell, **turns)
+            # Not the maps to be padded: XLA folds the padding of what needs no conversion into the convolution, whose kernel gradient on
+            # a GPU is then no longer recognised as one.
+            maps = pick_crops(jnp.concatenate([current, goal], -1).astype(self.dtype), pick_cell, **turns)
             query = self.query(*jnp.split(maps, 2, axis=-1))
             key = self.key(current, goal)
         scale = self.crop**-2 * self.channels**-0.5

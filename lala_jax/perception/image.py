@@ -13,22 +13,26 @@ from lala_jax.perception import transforms
 
 
 def sample(image: Float[Array, "rows cols c"], at: Float[Array, "... 2"]) -> Float[Array, "... c"]:
-    """Read an image bilinearly at continuous `(row, col)` `[..., 2]` (the centre of `[i, j]` is `(i + 0.5, j + 0.5)`), zero outside."""
+    """Read an image bilinearly at continuous `(row, col)` `[..., 2]` (the centre of `[i, j]` is `(i + 0.5, j + 0.5)`), zero outside.
+
+    What is read has the image's type; sums are at least float32.
+    """
     rows, cols, channels = image.shape
     low = jnp.floor(at - 0.5)
     frac = at - 0.5 - low
     row, col = low[..., 0].astype(jnp.int32), low[..., 1].astype(jnp.int32)
     flat = image.reshape(rows * cols, channels)
-    out = jnp.zeros(at.shape[:-1] + (channels,), image.dtype)
+    wide = jnp.promote_types(image.dtype, jnp.float32)
+    out = jnp.zeros(at.shape[:-1] + (channels,), wide)
     for down in (0, 1):
         for right in (0, 1):
             i, j = row + down, col + right
             weight = jnp.abs(1 - down - frac[..., 0]) * jnp.abs(1 - right - frac[..., 1])
             inside = (i >= 0) & (i < rows) & (j >= 0) & (j < cols)
-            weight = jnp.where(inside, weight, 0.0).astype(image.dtype)
+            weight = jnp.where(inside, weight, 0.0).astype(wide)
             index = jnp.clip(i, 0, rows - 1) * cols + jnp.clip(j, 0, cols - 1)
             out += flat.at[index].get(mode="promise_in_bounds") * weight[..., None]
-    return out
+    return out.astype(image.dtype)
 
 
 def rotation_offsets(yaw, size: int):

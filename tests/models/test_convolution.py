@@ -1,4 +1,4 @@
-"""Convolutions over blocks of cells, as a product, and with a gradient of their own, against XLA's, with all gradients."""
+"""Convolutions over blocks of cells, and with a gradient of their own, against XLA's, with all gradients."""
 
 import flax.linen as nn
 import jax
@@ -50,18 +50,6 @@ def test_nothing_is_dilated_backward():
     assert "lhs_dilate = [2, 2]" in reference.lower(jnp.zeros((1, 8, 8, 3))).as_text()
 
 
-@pytest.mark.parametrize("strides", [(1, 1), (2, 2), (3, 2)])
-def test_a_product_has_the_values_and_gradients_of_a_convolution_with_one_cell(strides):
-    x = jax.random.normal(jax.random.key(0), (2, 9, 12, 3))
-    layers = [
-        nn.Conv(4, (1, 1), strides, padding=0, conv_general_dilated=one) for one in (jax.lax.conv_general_dilated, convolution.pointwise)
-    ]
-    params = layers[0].init(jax.random.key(1), x)
-    want, got = (jax.value_and_grad(lambda p, x, layer=layer: jnp.sin(layer.apply(p, x)).sum(), (0, 1))(params, x) for layer in layers)
-    assert layers[1].apply(params, x).shape == layers[0].apply(params, x).shape
-    jax.tree.map(lambda mine, theirs: np.testing.assert_allclose(mine, theirs, atol=1e-4), got, want)
-
-
 @pytest.mark.parametrize("size, padding", [((3, 3), ((1, 1), (1, 1))), ((2, 3), ((0, 3), (4, 0))), ((1, 1), ((0, 0), (0, 0)))])
 def test_the_kernels_gradient_as_a_product_is_that_of_the_convolution(size, padding):
     """Of a batch of images, and of batches that `vmap` makes."""
@@ -86,16 +74,6 @@ def test_the_input_is_not_turned_for_it():
 
     turned = "dim_numbers = [f, 0, 1, b]x"
     assert turned in text(jax.lax.conv_general_dilated) and turned not in text(convolution.narrowing)
-
-
-@pytest.mark.parametrize(
-    "kernel, change",
-    [((3, 1), {}), ((1, 1), {"padding": [(0, 1), (0, 0)]}), ((1, 1), {"rhs_dilation": (2, 2)}), ((1, 1), {"feature_group_count": 3})],
-)
-def test_a_product_refuses_what_it_cannot_do(kernel, change):
-    how = {"window_strides": (1, 1), "padding": [(0, 0), (0, 0)]} | change
-    with pytest.raises(ValueError, match="needs a kernel of 1x1 without padding, dilation or groups, got"):
-        convolution.pointwise(jnp.zeros((1, 8, 8, 3)), jnp.zeros((*kernel, 3, 4)), **how)
 
 
 @pytest.mark.parametrize(

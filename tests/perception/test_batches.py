@@ -1,5 +1,7 @@
 """Items one after the other and all at once: the same values, the same gradients."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,6 +24,19 @@ def test_both_ways_give_the_same_values_and_gradients():
     for other in found[1:]:
         jax.tree.map(lambda mine, theirs: np.testing.assert_allclose(mine, theirs, rtol=1e-5), other, found[0])
     assert {name: leaf.shape for name, leaf in batches.each(one, items).items()} == {"sum": (3,), "max": (3,)}
+
+
+@pytest.mark.parametrize("at_once, groups", [(1, [1]), (2, [2, 1]), (3, [3]), (7, [3])])
+def test_some_at_a_time_give_what_all_do(at_once, groups):
+    """Also where their number is no multiple; and never more than that at once."""
+    items = jax.random.normal(jax.random.key(0), (3, 5))
+
+    def every(items):
+        return batches.each(lambda item: jnp.sin(item).sum(), items, method="vmap", at_once=at_once)
+
+    np.testing.assert_allclose(every(items), np.sin(np.asarray(items)).sum(-1), rtol=1e-5)
+    text = jax.jit(every).lower(items).as_text()
+    assert sorted(map(int, re.findall(r"sine .*tensor<(\d)x5xf32>", text)), reverse=True) == groups
 
 
 def test_another_method_is_refused():

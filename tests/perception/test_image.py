@@ -22,6 +22,14 @@ def test_sample_equals_scipy_inside_at_the_rim_and_outside():
     np.testing.assert_allclose(image.sample(jnp.asarray(PICTURE), jnp.asarray(at)), expected, atol=3e-6)
 
 
+def test_sample_of_a_short_type_is_rounded_once():
+    at = jnp.asarray(RNG.uniform([-1, -1], [15, 12], (500, 2)), jnp.float32)
+    short = jnp.asarray(PICTURE, jnp.bfloat16)
+    got = image.sample(short, at)
+    assert got.dtype == jnp.bfloat16
+    np.testing.assert_array_equal(got, image.sample(short.astype(jnp.float32), at).astype(jnp.bfloat16))
+
+
 def test_sample_at_cell_centres_is_the_image():
     index = np.stack(np.meshgrid(np.arange(14), np.arange(11), indexing="ij"), axis=-1)
     np.testing.assert_array_equal(image.sample(jnp.asarray(PICTURE), jnp.asarray(index + 0.5, jnp.float32)), PICTURE)
