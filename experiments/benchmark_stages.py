@@ -18,13 +18,13 @@ import numpy as np
 import optax
 
 from experiments import timing
+from experiments.benchmark_targets import EPISODES
 from lala_jax import build, checkpoint, compiling, losses, options, policy, recording, rollout, scoring, state, train_step, types
 from lala_jax.models import correlation, transporter
 from lala_jax.perception import topdown
 from lala_jax.sim import oracle, physics, render, robot, scene
 
 BATCH = 8  # observations at a time, where a stage takes several
-EPISODES = 100  # of a closed loop
 FULL = {"camera.height": 480, "camera.width": 640}  # the cameras' own resolution
 EGL = {"MUJOCO_GL": "egl"} if sys.platform == "linux" else {}  # renders without a display
 
@@ -278,7 +278,7 @@ def evaluation(config) -> timing.Work:
     def run():
         scoring.evaluate(agent, params, observer, seeds=seeds, parallel=parallel, threads=config.data.threads)
 
-    return timing.Work(run, EPISODES)
+    return timing.Work(run, EPISODES, cold=True)
 
 
 def trained_state(config) -> tuple[state.TrainState, dict[str, Any]]:
@@ -369,7 +369,7 @@ STAGES = {
     "train-paper-torch": timing.Stage("that with PyTorch", "sample", paper_torch, alone=True, needs=("torch",)),
     "primitive": timing.Stage("one action of the arm", "action", primitive),
     "collect": timing.Stage("demonstrations", "demonstration", collection),
-    "evaluate": timing.Stage("closed loop, 100 episodes and compiling", "episode", evaluation),
+    "evaluate": timing.Stage(f"closed loop, {EPISODES} episodes and compiling", "episode", evaluation),
     "save": timing.Stage("save a checkpoint", "checkpoint", save),
     "restore": timing.Stage("restore a checkpoint", "checkpoint", restore),
 }

@@ -10,6 +10,7 @@ from typing import Any
 from experiments import common
 
 Row = Mapping[str, Any]
+EPISODES = 100  # of a closed loop
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +63,7 @@ TARGETS = (
     gpu("training step, a sample, batch 64", 0.001, "s", ("train-many",), seconds),
     gpu("render, unproject and fuse an observation, batch 64", 0.0005, "s", ("observe-many",), seconds),
     Target("a demonstration of a tower", 0.5, "s", ("collect",), seconds, task="tower"),
-    Target("closed loop of 100 episodes", 180, "s", ("evaluate",), functools.partial(seconds, of=100)),
+    Target(f"closed loop of {EPISODES} episodes", 180, "s", ("evaluate",), functools.partial(seconds, of=EPISODES)),
     cpu("input pipeline's share of the training step", 0.15, "%", ("inputs", "train"), ratio),
     Target("programs compiled again after a first run", 0, "", (), again),
     Target("starting Python and importing lala_jax", 0.3, "s", ("import",), seconds),

@@ -39,6 +39,7 @@ class Work:
     count: int = 1  # things that one run does
     facts: Mapping[str, float] = dataclasses.field(default_factory=dict)  # of one run: flops, bytes, memory; and compile_seconds
     close: Callable[[], Any] = lambda: None  # gives back what it took
+    cold: bool = False  # what its first run takes is asked for, compiling and all: there is no other
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,7 +76,8 @@ def stepping(step, run: Any, *inputs: Any, count: int = 1) -> Work:
 def measured(work: Work, repeats: int) -> dict[str, Any]:
     """Run some work up to `repeats` times, for SECONDS, after as many to warm up, for WARM: seconds a thing, and rates.
 
-    One run is not enough to warm up: it may be the fifth that finds all its memory kept. A first run of over ONCE is the only one.
+    One run is not enough to warm up: it may be the fifth that finds all its memory kept. A first run of over ONCE is the only one,
+    as is that of work that is `cold`.
     """
 
     def clocked() -> float:
@@ -85,13 +87,13 @@ def measured(work: Work, repeats: int) -> dict[str, Any]:
 
     with contextlib.closing(work):
         begin, first = time.perf_counter(), clocked()
-        before = len(compilations())
-        for _ in range(1, repeats):
+        before, only = len(compilations()), work.cold or first > ONCE
+        for _ in range(1, 1 if only else repeats):
             if time.perf_counter() - begin > WARM:
                 break
             clocked()
-        runs, begin = [first] if first > ONCE else [], time.perf_counter()
-        while first <= ONCE and len(runs) < repeats and (not runs or time.perf_counter() - begin < SECONDS):
+        runs, begin = [first] if only else [], time.perf_counter()
+        while not only and len(runs) < repeats and (not runs or time.perf_counter() - begin < SECONDS):
             runs.append(clocked())
     runs = [seconds / work.count for seconds in runs]
     again = len(compilations()) - before

@@ -47,6 +47,8 @@ def test_what_is_slow_is_not_repeated(clock, seconds, runs, calls):
 
     found = timing.measured(timing.Work(run), repeats=9)
     assert found["runs"] == runs and found["seconds"] == seconds and len(called) == calls
+    found = timing.measured(timing.Work(run, cold=True), repeats=9)
+    assert found["runs"] == 1 and found["seconds"] == seconds and len(called) == calls + 1
 
 
 def test_xla_counts_what_a_product_takes():
