@@ -13,6 +13,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.interpreters import partial_eval
 
 # On a CPU, XLA hands convolutions and what is around them to a library, YNN. The kernel gradient of a 3x3 convolution of 24 channels
 # over 8 x 160 x 80 cells takes it 157 ms, and XLA's own convolution 13 (jaxlib 0.10.2, two cores). "" hands it nothing; other platforms
@@ -62,14 +63,20 @@ def flops(jaxpr) -> float:
     """Count the operations of a jaxpr's matrix products, convolutions and Fourier transforms; the rest is left out.
 
     XLA counts a loop's body once, and on a GPU not what libraries do. Here a scan's is taken as often as it runs, that of a loop of
-    unknown length once, and of branches the dearest.
+    unknown length once, and of branches the dearest. What no result needs is not counted: a derivative written by hand may give more than
+    is asked for, and XLA leaves that out.
     """
+    whole = getattr(jaxpr, "jaxpr", jaxpr)
+    return _counted(partial_eval.dce_jaxpr(whole, [True] * len(whole.outvars))[0])
+
+
+def _counted(jaxpr) -> float:
     total = 0.0
     for equation in getattr(jaxpr, "jaxpr", jaxpr).eqns:
         name, params = equation.primitive.name, equation.params
         if name in _COUNTS:
             total += _COUNTS[name](params, *(variable.aval.shape for variable in (*equation.invars, *equation.outvars)))
-        within = [flops(one) for value in params.values() for one in _jaxprs(value)]
+        within = [_counted(one) for value in params.values() for one in _jaxprs(value)]
         if within:
             total += max(within) if name == "cond" else sum(within) * (params["length"] if name == "scan" else 1)
     return total

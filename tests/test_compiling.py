@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import pytest
 
 from lala_jax import compiling
+from lala_jax.models import convolution
 
 FIELDS = ("jax_compilation_cache_dir", "jax_enable_compilation_cache")
 
@@ -131,6 +132,22 @@ def test_operations_are_those_that_xla_counts(function, shapes):
     traced = jax.jit(function).trace(*[jnp.ones(shape) for shape in shapes])
     cost = traced.lower().cost_analysis()
     assert cost is not None and compiling.flops(traced.jaxpr) == pytest.approx(cost["flops"], rel=0.02)
+
+
+def test_what_no_result_needs_is_not_counted():
+    """Neither in a loop, nor the input's gradient of a convolution whose derivative is written by hand."""
+    x, kernel = jnp.ones((1, 8, 8, 40)), jnp.ones((3, 3, 40, 4))
+
+    def count(function):
+        return compiling.flops(jax.jit(function).trace(kernel).jaxpr)
+
+    def convolve(kernel):
+        return convolution.narrowing(x, kernel, (1, 1), ((1, 1), (1, 1)), dimension_numbers=("NHWC", "HWIO", "NHWC"))
+
+    product = 2 * 64 * 9 * 40 * 4  # all cells with all entries
+    assert count(jax.grad(lambda kernel: convolve(kernel).sum())) == product
+    assert count(jax.value_and_grad(lambda kernel: convolve(kernel).sum())) == product + count(convolve)
+    assert 0 == count(lambda kernel: jax.lax.scan(lambda c, _: (c, convolve(c)), kernel, length=3)[0]) < count(convolve)
 
 
 def test_what_a_loop_does_is_counted_as_often_as_it_runs():
