@@ -120,16 +120,6 @@ def test_computes_in_bfloat16_with_float32_parameters():
     assert jax.eval_shape(net.apply, params, image)[0].dtype == jnp.bfloat16
 
 
-def test_what_a_gpu_computes_is_the_same(monkeypatch):
-    net, image = blocks.ResNet43_8s(2, width=8, stages=3), jax.random.normal(jax.random.key(0), (8, 12, 3))
-    params = jax.jit(net.init)(jax.random.key(1, impl="rbg"), image)
-    want = jax.jit(net.apply)(params, image)[0]
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    program = jax.jit(lambda params: net.apply(params, image)[0]).lower(params)
-    assert "dot_general" in program.as_text()
-    np.testing.assert_allclose(program.compile()(params), want, atol=1e-4)
-
-
 def test_slopes_are_the_same_with_many_channels(monkeypatch):
     """Those of a stem that takes the kernel's gradient as a product, on a CPU, and those of XLA's convolution elsewhere."""
     net, image = blocks.ResNet43_8s(2, width=4, stages=2), jax.random.normal(jax.random.key(0), (2, 8, 12, 40))

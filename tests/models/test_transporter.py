@@ -181,6 +181,15 @@ def test_jit_equals_eager_and_vmap_equals_a_loop():
         jax.tree.map(lambda all_, one, index=index: np.testing.assert_allclose(all_[index], one, atol=2e-5), batch, one)
 
 
+def test_maps_are_padded_before_they_are_converted():
+    """Crops are cut from converted ones. XLA folds the padding of a converted map into the convolution: see the module."""
+    net, *inputs = _built(dtype=jnp.bfloat16)
+    text = jax.jit(net.apply).lower(*inputs).as_text()
+    padded = [line.rpartition("(")[2] for line in text.splitlines() if "stablehlo.pad" in line and "(tensor<12x8x4x" in line]
+    assert len(padded) == 2 and all(line.startswith("tensor<12x8x4xf32>") for line in padded)
+    assert "tensor<12x8x8xbf16>" in text
+
+
 def test_maps_of_any_size_keep_their_cells():
     """Sides that the strides do not divide are padded and cut: a map with a border of zeros spelled out scores the same."""
     net, params, current, goal = _built(rows=11, cols=7, variant="single")
