@@ -87,14 +87,15 @@ def measured(work: Work, repeats: int) -> dict[str, Any]:
 
     with contextlib.closing(work):
         begin, first = time.perf_counter(), clocked()
-        before, only = len(compilations()), work.cold or first > ONCE
-        for _ in range(1, 1 if only else repeats):
-            if time.perf_counter() - begin > WARM:
-                break
-            clocked()
-        runs, begin = [first] if only else [], time.perf_counter()
-        while not only and len(runs) < repeats and (not runs or time.perf_counter() - begin < SECONDS):
-            runs.append(clocked())
+        before, runs = len(compilations()), [first]
+        if not work.cold and first <= ONCE:
+            for _ in range(1, repeats):
+                if time.perf_counter() - begin > WARM:
+                    break
+                clocked()
+            runs, begin = [], time.perf_counter()
+            while len(runs) < repeats and (not runs or time.perf_counter() - begin < SECONDS):
+                runs.append(clocked())
     runs = [seconds / work.count for seconds in runs]
     again = len(compilations()) - before
     seconds = float(np.median(runs))
