@@ -77,11 +77,14 @@ def record(config) -> None:
         recording.collect(config, quiet=True)
 
 
-def choose(rows: Sequence, names: str, task: str) -> list:
-    """Give the first row, with which the others are compared, and those of `names` (comma-separated, "" for all) that apply to the task."""
+def choose(rows: Sequence, names: str, task: str, *, reference: bool = True) -> list:
+    """Give the rows of `names` (comma-separated, "" for all) that apply to the task.
+
+    With `reference` the first is always among them: the others are compared with it.
+    """
     valid = [row for row in rows if task in (row.tasks or (task,))]
     wanted = [options.check_choice("--rows", name, [row.name for row in valid]) for name in names.split(",") if name]
-    return [row for row in valid if not wanted or row.name in wanted or row is valid[0]]
+    return [row for row in valid if not wanted or row.name in wanted or (reference and row is valid[0])]
 
 
 def identity(row: Row, config, seeds: Sequence[int], *, weights: Mapping[str, Any] | None) -> dict[str, Any]:

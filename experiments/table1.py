@@ -4,12 +4,12 @@ Trains every row of `ROWS` on the same demonstrations with the same number of sa
 writes `<scale>-<task>.json` (see `common`; a row has `published`, the paper's number or null, `parameters`, `samples` and `train_seconds`
 besides), `<scale>.md`, a table of both tasks as far as they are there, and `<scale>.webp`, the same as bars, to `--out`. The scales are
 `smoke` (every part, scores that mean nothing), `cpu` (the paper's pictures, maps, crops and widths divided by four, so that a row trains
-in half an hour on two cores) and `paper` (its own sizes, optimiser and number of samples, in bfloat16; for a GPU).
+in half an hour on two cores), `cpu-long` (the same with the paper's number of samples, one to four hours of a core a row) and `paper` (its
+own sizes, optimiser and number of samples, in bfloat16; for a GPU).
 Runs lie in `--workdir`, runs/table1/<task> unless told, each in <scale>-<row>. Started again, it goes on with the rows that are
-missing, and within a row where its training stopped; `--rows=two-stream,ours` runs only these (and the first). The row `cliport-clip`
-needs CLIP's own weights: `--clip=RN50.safetensors --clip-tokenizer=tokenizer.json`, which `clip_file` reads. With `--launcher=slurm` or
-`local` each row is a worker's (see `lala_jax.cluster`), after others recorded the demonstrations and pre-trained the backbone that rows
-share.
+missing, and within a row where its training stopped; `--rows=two-stream,ours` runs only these. The row `cliport-clip` needs CLIP's own
+weights: `--clip=RN50.safetensors --clip-tokenizer=tokenizer.json`, which `clip_file` reads. With `--launcher=slurm` or `local` each row
+is a worker's (see `lala_jax.cluster`), after others recorded the demonstrations and pre-trained the backbone that rows share.
 """
 
 from __future__ import annotations
@@ -94,6 +94,7 @@ ROWS = (
     Entry("oracle", "oracle", agent="oracle"),
 )
 LINES = ("blind", "top_view")  # drawn through the bars
+SAMPLES = ("train.steps=2500", "train.batch_size=8")  # the paper's 20 000, eight at a time
 # What every row shares, and what the rows of a family do.
 SCALES = {
     "smoke": (
@@ -102,30 +103,35 @@ SCALES = {
         *("pretrain.steps=2", "pretrain.scenes=2", "pretrain.batch_size=2", "pretrain.window=32"),
     ),
     "cpu": ("data.demos=500", "train.steps=400", "train.batch_size=8", "eval.episodes=100"),
-    "paper": ("data.demos=500", "camera.height=480", "camera.width=640", "train.save_every=1000", "eval.episodes=100", "eval.parallel=4"),
+    "cpu-long": ("data.demos=500", *SAMPLES, "eval.episodes=100"),
+    "paper": (
+        *("data.demos=500", *SAMPLES, "train.save_every=1000", "eval.episodes=100", "eval.parallel=4"),
+        *("camera.height=480", "camera.width=640"),
+    ),
 }
-FEW = {"smoke": 2, "cpu": 50, "paper": 50}
+SIZES = {"cpu-long": "cpu"}  # a scale whose families are of another one's sizes
+FEW = {"smoke": 2, "cpu": 50, "cpu-long": 50, "paper": 50}
 QUARTER = ("camera.height=120", "camera.width=160", "map.cell=0.0125")
 PAPER = {
     "smoke": ("model.width=4", "model.stages=2", "camera.stage=stem"),
     "cpu": (*QUARTER, "model.crop=16", "model.width=16", "pretrain.window=32", "pretrain.patch=4"),
     "paper": (
         *("map.cell=0.003125", "model.crop=64", "model.channels=3", "model.width=64", "model.dtype=bfloat16"),
-        # The paper's 20 000 samples, eight at a time, and for that the root of eight times its learning rate of 1e-4.
-        *("train.steps=2500", "train.batch_size=8", "optim.schedule=constant", "optim.learning_rate=2.83e-4", "optim.weight_decay=0.0"),
+        # As eight samples are taken at a time, the root of eight times the paper's learning rate of 1e-4.
+        *("optim.schedule=constant", "optim.learning_rate=2.83e-4", "optim.weight_decay=0.0"),
     ),
 }
 OURS = {
     "smoke": ("model.width=4", "model.trunk_width=8", "model.trunk_blocks=1", "model.tokens=40"),
     "cpu": (),
-    "paper": ("train.steps=2500", "train.batch_size=8"),
+    "paper": (),
 }
 FAMILIES = {
     "ours": OURS,
     "same": {
         "smoke": (*OURS["smoke"], "model.crop=12"),
         "cpu": (*QUARTER, "model.crop=12", "model.tokens=352"),
-        "paper": (*OURS["paper"], "map.cell=0.003125", "model.crop=48", "model.tokens=2816"),
+        "paper": ("map.cell=0.003125", "model.crop=48", "model.tokens=2816"),
     },
     "paper": PAPER,
     "cliport": {"smoke": ("model.width=4", "model.stages=3"), **{scale: PAPER[scale] for scale in ("cpu", "paper")}},
@@ -135,7 +141,7 @@ FAMILIES = {
         "cpu": (*PAPER["cpu"], "model.stages=5", "model.crop=32"),
         "paper": (*PAPER["paper"], "model.stages=5"),
     },
-    "graph": {"smoke": ("model.width=8",), "cpu": ("model.width=64",), "paper": ("model.width=64", "train.steps=2500")},
+    "graph": {"smoke": ("model.width=8",), "cpu": ("model.width=64",), "paper": ("model.width=64",)},
 }
 FLAGS = {
     **{"task": "tower", "scale": "cpu", "rows": "", "split": "test", "start": 0, "seed": 0, "out": "experiments/results/table1"},
@@ -155,7 +161,9 @@ def main(
     seeds, out_path = build.split_seeds(split, start, base.eval.episodes), pathlib.Path(out)
     runs = f"{build.workdir(config, workdir)}/{scale}"
     files = tuple(f"model.{name}={path}" for name, path in (("clip", clip), ("clip_tokenizer", clip_tokenizer)) if path)
-    chosen = [row for row in common.choose(plan(scale, files), rows, task) if can_run(row, files)]
+    chosen = [row for row in common.choose(plan(scale, files), rows, task, reference=False) if can_run(row, files)]
+    if not chosen:
+        raise options.OptionsError(f"--rows={rows}: none of these can run, for want of what is said above")
     for row in chosen:
         if row.clip:
             build.build_policy(row.configs(base)[0])  # before hours of other rows, whether the files will do
@@ -181,9 +189,10 @@ def shared(config, scale: str) -> list[str]:
 
 def plan(scale: str, clip: tuple[str, ...] = ()) -> list[Entry]:
     """List the rows with all overrides of a scale: the family's sizes first, then what the row is, then CLIP's files if it needs them."""
+    size = SIZES.get(scale, scale)
     few, files = {True: (f"data.demos={FEW[scale]}",), False: ()}, {True: clip, False: ()}
     return [
-        dataclasses.replace(row, overrides=(*FAMILIES[row.family][scale], *few[row.few], *row.overrides, *files[row.clip])) for row in ROWS
+        dataclasses.replace(row, overrides=(*FAMILIES[row.family][size], *few[row.few], *row.overrides, *files[row.clip])) for row in ROWS
     ]
 
 

@@ -273,9 +273,11 @@ def test_the_table_has_a_row_for_those_who_have_the_files(files, monkeypatch, tm
         return {"score": 50.0, "interval95": [None, None], "complete_percent": 0.0, "parameters": 7, "train_seconds": 1.0}
 
     monkeypatch.setattr(table1, "run", fake)
-    table1.command(given)
-    assert [name for name, _ in trained] == ["ours"]
-    assert "cliport-clip is left out: it needs --clip=PATH, CLIP's weights, and --clip-tokenizer=PATH" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match="2"):
+        table1.command(given)
+    told = capsys.readouterr()
+    assert not trained and "--rows=cliport-clip: none of these can run" in told.err
+    assert "cliport-clip is left out: it needs --clip=PATH, CLIP's weights, and --clip-tokenizer=PATH" in told.out
     own = [text.replace("model.", "--") for text in files]
     table1.command([*given, *own])
     (name, config), published = trained[-1], json.loads((tmp_path / "smoke-tower.json").read_text())["rows"][-1]["published"]

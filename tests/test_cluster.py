@@ -338,7 +338,6 @@ def test_what_rows_share_comes_before_them(monkeypatch, tmp_path):
     assert {name: one.needs for name, one in ran.items()} == {
         f"{recorded}-smoke": (),
         "the backbone": (),
-        "ours": (f"{recorded}-smoke",),
         "two-stream-scene": (f"{recorded}-smoke", "the backbone"),
         "two-stream-scene-50": (f"{recorded}-smoke", "the backbone"),
         "oracle": (),
