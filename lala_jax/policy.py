@@ -6,6 +6,7 @@ A policy is a static, hashable object; its parameters travel beside it. All that
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Protocol
@@ -155,12 +156,20 @@ def hits(sample: Sample, pick_logits: jax.Array, place_logits: jax.Array, *, spe
     }
 
 
-def picture(topdown_map: types.TopDownMap, *, max_height: bool) -> jax.Array:
-    """Give a map `[rows, cols, c]` as the paper's networks take it: what is highest, or without `max_height` all slices as channels."""
+def picture(*maps: types.TopDownMap, max_height: bool) -> jax.Array:
+    """Give a map `[rows, cols, c]` as the paper's networks take it: what is highest, or without `max_height` all slices as channels.
+
+    Several maps are multiplied first, channel by channel in their own units: colours in 0..1, features as they are, heights in metres.
+    """
+
+    def product(of: Callable[[types.TopDownMap], jax.Array]) -> jax.Array:
+        return functools.reduce(jnp.multiply, [of(one) for one in maps])
+
     if max_height:
-        return transporter.normalise(topdown.max_height(topdown_map))
-    slices = transporter.normalise_slices(topdown_map.features[..., :3], topdown_map.count > 0, topdown_map.height)
-    return slices if topdown_map.surface is None else jnp.concatenate([slices, topdown_map.surface], axis=-1)
+        return transporter.normalise(product(topdown.max_height))
+    colors, seen, heights = (product(of) for of in (lambda one: one.features[..., :3], lambda one: one.count > 0, lambda one: one.height))
+    slices = transporter.normalise_slices(colors, seen, heights)
+    return slices if maps[0].surface is None else jnp.concatenate([slices, product(lambda one: one.surface)], axis=-1)
 
 
 def imitation(sample: Sample, logits: Heatmaps, *, spec: types.MapSpec) -> tuple[jax.Array, dict[str, jax.Array]]:
@@ -372,11 +381,11 @@ class TransporterPolicy:
     def init(self, key: jax.Array):
         """Make the parameters."""
         blank = picture(empty_map(self.spec, surface=self.surface), max_height=self.max_height)
-        return self.model.init(key, blank, blank, jnp.zeros(2, jnp.int32))["params"]
+        return self.model.init(key, blank, blank, jnp.zeros(2, jnp.int32), blank)["params"]
 
     def _look(self, params, current, goal, pick=None):
-        current, goal = (picture(one, max_height=self.max_height) for one in (current, goal))
-        logits, intermediates = self.model.apply({"params": params}, current, goal, pick)
+        seen = [picture(*maps, max_height=self.max_height) for maps in ((current,), (goal,), (current, goal))]
+        logits, intermediates = self.model.apply({"params": params}, *seen[:2], pick, seen[2])
         return Heatmaps(logits["pick"], logits["place"]), intermediates["pick_cell"]
 
     def loss(self, params, key: jax.Array, state: types.State, current: types.TopDownMap, goal: types.TopDownMap):

@@ -71,8 +71,9 @@ class Transporter(nn.Module):
     and one more for the goal, `g`, where there is one:
 
     - "transporter" ignores the goal: Transporter Networks, the control.
-    - "image_goal" picks from `pick(current * goal)`, and adds: `key(current) + g(goal)`, `query(crops) + g(goal crops)`
-      (CLIPort, `AttentionImageGoal` and `TransportImageGoal`). Its product is of raw images, ours of what we are given.
+    - "image_goal" picks from the product of both images, `pick(both)`, and adds: `key(current) + g(goal)`, `query(crops) + g(goal crops)`
+      (CLIPort, `AttentionImageGoal` and `TransportImageGoal`). The product must be of raw images, normalised afterwards: a normalised
+      table is about zero, and times that nothing is left of what lies where the goal is bare. CLIPort's colours are 0..255 then.
     - "goal_split" picks without the goal and multiplies: `key(current) * g(goal)`, and `query(current) * g(goal)` of the whole
       map, of which the crops are cut (Ravens, `TransportGoal`; its hourglass also has biases, and strides in the first 1x1).
 
@@ -115,30 +116,39 @@ class Transporter(nn.Module):
         return blocks.ResNet43_8s(out, self.width, self.stages, self.dtype)
 
     def __call__(
-        self, current: Float[Array, "rows cols c"], goal: Float[Array, "rows cols c"], pick_cell: Int[ArrayLike, 2] | None = None
+        self,
+        current: Float[Array, "rows cols c"],
+        goal: Float[Array, "rows cols c"],
+        pick_cell: Int[ArrayLike, 2] | None = None,
+        both: Float[Array, "rows cols c"] | None = None,
     ) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
         """Score every pick and, for the pick at integer `(row, col)`, every place: `(logits, intermediates)`.
+
+        Only "image_goal" looks at `both`, the product of the two images, and needs it.
 
         `logits` has `pick` `[rows, cols]` and `place` `[yaw_bins, rows, cols]`, each for one softmax over all its entries.
         Without a `pick_cell` the best pick is taken; `intermediates` names the cell, the key map and the query crops.
         """
-        pick = self.pick(current, goal)
+        pick = self.pick(current, goal, both)
         if pick_cell is None:
             pick_cell = jnp.stack(jnp.unravel_index(jnp.argmax(pick), pick.shape))
         place, intermediates = self.place(current, goal, jnp.asarray(pick_cell))
         return {"pick": pick, "place": place}, intermediates
 
-    def pick(self, current: Float[Array, "rows cols c"], goal: Float[Array, "rows cols c"]) -> Float[Array, "rows cols"]:
-        """Score every cell as a pick; the maps are padded to a square, as in the paper."""
+    def pick(
+        self, current: Float[Array, "rows cols c"], goal: Float[Array, "rows cols c"], both: Float[Array, "rows cols c"] | None = None
+    ) -> Float[Array, "rows cols"]:
+        """Score every cell as a pick; the maps are padded to a square, as in the paper. Raises ValueError where `both` is missing."""
+        if self.variant == "image_goal" and both is None:
+            raise ValueError('Transporter of variant "image_goal" picks from the product of both images: give both')
         rows, cols = current.shape[:2]
         side = self._round_up(max(rows, cols))
         top, left = (side - rows) // 2, (side - cols) // 2
         pads = (top, side - rows - top), (left, side - cols - left)
-        current, goal = _pad(current, *pads), _pad(goal, *pads)
         if self.variant in streams.VARIANTS:
-            logits = self.pick_net(current, goal)
+            logits = self.pick_net(_pad(current, *pads), _pad(goal, *pads))
         else:
-            logits = self._alone(self.pick_net, current * goal if self.variant == "image_goal" else current)
+            logits = self._alone(self.pick_net, _pad(both if self.variant == "image_goal" else current, *pads))
         return logits[top : top + rows, left : left + cols, 0]
 
     def place(

@@ -67,9 +67,10 @@ def test_rivals_have_the_public_parameters(variant, goal_nets, public, biases):
     assert sum(counts) == public
     net = transporter.Transporter(variant)
     image = jax.ShapeDtypeStruct((320, 160, 6), jnp.float32)
-    params = jax.eval_shape(net.init, jax.random.key(0), image, image)
+    cell = jax.ShapeDtypeStruct((2,), jnp.int32)
+    params = jax.eval_shape(net.init, jax.random.key(0), image, image, cell, image)
     assert sum(leaf.size for leaf in jax.tree.leaves(params)) == public - biases
-    logits, intermediates = jax.eval_shape(net.apply, params, image, image, jax.ShapeDtypeStruct((2,), jnp.int32))
+    logits, intermediates = jax.eval_shape(net.apply, params, image, image, cell, image)
     assert logits["pick"].shape == (320, 160) and logits["place"].shape == (36, 320, 160)
     assert intermediates["key"].shape == (384, 224, 3) and intermediates["query"].shape == (36, 64, 64, 3)
 
@@ -79,20 +80,21 @@ def test_rivals_equal_their_formulas_in_numpy(variant):
     """From the maps to both logits on the same random weights, and a goal matters unless it is ignored."""
     net = transporter.Transporter(variant, **(SMALL | {"width": 4}))
     current, goal = np.asarray(_maps())
-    params, cell = _drawn(net, current, goal), (8, 2)
+    both, cell = current * goal + 1, (8, 2)
+    params = _drawn(net, current, goal, np.array(cell), both)
     apply = jax.jit(net.apply)
-    logits, intermediates = apply(params, current, goal, jnp.array(cell))
+    logits, intermediates = apply(params, current, goal, jnp.array(cell), both)
 
     def features(name, *maps):
         return [reference.hourglass(params["params"][f"{name}_net"], one, 2) for one in maps]
 
-    square = [np.pad(one, ((0, 0), (2, 2), (0, 0))) for one in (current, goal)]
+    square = [np.pad(one, ((0, 0), (2, 2), (0, 0))) for one in (current, both)]
     wide = [np.pad(one, ((4, 4), (4, 4), (0, 0))) for one in (current, goal)]
     crops = [reference.quarter_crops(one, cell, 8) for one in (current, goal)]
     if variant == "transporter":
         (pick,), (key,), (query,) = features("pick", square[0]), features("key", wide[0]), features("query", crops[0])
     if variant == "image_goal":
-        (pick,), (key,), (query,) = features("pick", square[0] * square[1]), features("key", wide[0]), features("query", crops[0])
+        (pick,), (key,), (query,) = features("pick", square[1]), features("key", wide[0]), features("query", crops[0])
         more_key, more_query = features("goal", wide[1], crops[1])
         key, query = key + more_key, query + more_query
     if variant == "goal_split":
@@ -105,7 +107,7 @@ def test_rivals_equal_their_formulas_in_numpy(variant):
     np.testing.assert_allclose(intermediates["query"], query, atol=1e-4)
     place = reference.places(key, query) / 8**2 / 3**0.5
     np.testing.assert_allclose(logits["place"], place, atol=1e-3 * place.std())
-    again, _ = apply(params, current, goal[::-1], jnp.array(cell))
+    again, _ = apply(params, current, goal[::-1], jnp.array(cell), both[::-1])
     assert np.array_equal(again["place"], logits["place"]) == (variant == "transporter")
     assert np.array_equal(again["pick"], logits["pick"]) == (variant != "image_goal")
 
@@ -115,13 +117,15 @@ def test_turning_both_maps_by_a_bin_turns_picks_and_places(variant):
     """With networks that look at single cells the law is exact: all turns about z, and what a held thing is turned by stays."""
     net = transporter.Transporter(variant, **(SMALL | {"crop": 9, "width": 4, "stages": 1}))
     maps = np.asarray(_maps(15, 15))
-    params = _drawn(net, *maps)
+    both = maps[0] * maps[1]
+    params = _drawn(net, *maps, np.array([6, 9]), both)
     centre = np.zeros((3, 3, 1, 1), np.float32)
     centre[1, 1] = 3.0
     params = jax.tree.map(lambda leaf: leaf * centre if leaf.shape[:2] == (3, 3) else leaf, params)
     apply = jax.jit(net.apply)
-    logits, _ = apply(params, *maps, jnp.array([6, 9]))
-    turned, _ = apply(params, *np.swapaxes(maps[:, ::-1], 1, 2), jnp.array([9, 14 - 6]))  # (row, col) goes to (col, -row)
+    logits, _ = apply(params, *maps, jnp.array([6, 9]), both)
+    # (row, col) goes to (col, -row)
+    turned, _ = apply(params, *np.swapaxes(maps[:, ::-1], 1, 2), jnp.array([9, 14 - 6]), np.swapaxes(both[::-1], 0, 1))
     np.testing.assert_allclose(turned["pick"], logits["pick"][::-1].T, atol=1e-4)
     expected = np.swapaxes(logits["place"][:, ::-1], 1, 2)
     np.testing.assert_allclose(turned["place"], expected, atol=1e-3 * expected.std())
@@ -270,3 +274,10 @@ def test_slices_lie_side_by_side():
 def test_refuses_bad_options_when_built(options, message):
     with pytest.raises(ValueError, match=message):
         transporter.Transporter(**options)
+
+
+def test_image_goal_asks_for_the_product():
+    net, *_ = _built(variant="transporter")
+    net = net.clone(variant="image_goal")
+    with pytest.raises(ValueError, match='"image_goal" picks from the product of both images: give both'):
+        jax.eval_shape(net.init, jax.random.key(0), *_maps())
