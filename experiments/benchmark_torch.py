@@ -97,7 +97,7 @@ class Transporter(nn.Module):
 
     def __init__(self, inputs: int = 6, *, yaw_bins: int = 36, crop: int = 64, channels: int = 3, width: int = 64, stages: int = 4):
         super().__init__()
-        self.yaw_bins, self.crop, self.scale = yaw_bins, crop, crop**-2 * channels**-0.5
+        self.yaw_bins, self.crop, self.scale = yaw_bins, crop, (crop * crop * channels) ** -0.5
         self.pick_net = TwoStream(inputs, 1, fuse=False, width=width, stages=stages)
         self.key_net = TwoStream(inputs, channels, fuse=True, width=width, stages=stages)
         self.query_net = TwoStream(inputs, channels, fuse=True, width=width, stages=stages)

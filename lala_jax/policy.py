@@ -6,7 +6,6 @@ A policy is a static, hashable object; its parameters travel beside it. All that
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Protocol
@@ -121,18 +120,19 @@ class Sample:
 def draw(key: jax.Array, state: types.State, *, spec: types.MapSpec, rotations: int, candidates: jax.Array, multi_action: bool) -> Sample:
     """Draw an object among `candidates` `[N]` bool, a cell of its visible top face, and say where it goes.
 
-    Without `multi_action` the drawn pick and its place of least turn are the only right ones (the paper's one-hot labels).
+    Without `multi_action` the drawn pick and its place of least turn are the only right ones (the paper's one-hot labels); it is then
+    drawn as the demonstrations pick, about the middle of the face.
     """
     key_object, key_cell = jax.random.split(key)
-    cells = losses.pick_valid(state, spec=spec)
+    whole, middle = (losses.pick_valid(state, spec=spec, share=share) for share in (1.0, MIDDLE))
+    cells = whole if multi_action else middle
     candidates = candidates & cells.any((1, 2))
     index = jax.random.categorical(key_object, jnp.where(candidates, 0.0, -1e9))
     flat = jax.random.categorical(key_cell, jnp.where(cells[index].ravel(), 0.0, -1e9))
     pick = jnp.stack([flat // spec.cols, flat % spec.cols]).astype(jnp.int32)
     label = losses.place_label(state, index, types.world_from_index(spec, pick))
     bins, places, valid = losses.place_index(label, spec=spec, rotations=rotations)
-    pick_valid = (cells & state.ready[:, None, None]).any(0)
-    pick_best = (losses.pick_valid(state, spec=spec, share=MIDDLE) & state.ready[:, None, None]).any(0)
+    pick_valid, pick_best = ((each & state.ready[:, None, None]).any(0) for each in (whole, middle))
     if not multi_action:
         least = jnp.argmin(jnp.where(valid, jnp.abs(jnp.mod(label.yaw + math.pi, 2 * math.pi) - math.pi), jnp.inf))
         valid = valid & (jnp.arange(valid.size) == least)
@@ -159,22 +159,24 @@ def hits(sample: Sample, pick_logits: jax.Array, place_logits: jax.Array, *, spe
 def picture(*maps: types.TopDownMap, max_height: bool) -> jax.Array:
     """Give a map `[rows, cols, c]` as the paper's networks take it: what is highest, or without `max_height` all slices as channels.
 
-    Several maps are multiplied first, channel by channel in their own units: colours in 0..1, features as they are, heights in metres.
+    Of several maps it is that of their geometric mean, channel by channel: what a product of them knows, in the units of one map (colours
+    in 0..1, heights in metres, features of a ReLU), so that the table of them all looks as the table of one.
     """
 
-    def product(of: Callable[[types.TopDownMap], jax.Array]) -> jax.Array:
-        return functools.reduce(jnp.multiply, [of(one) for one in maps])
+    def mean(of: Callable[[types.TopDownMap], jax.Array]) -> jax.Array:
+        values = [of(one) for one in maps]
+        return values[0] if len(maps) == 1 else jnp.maximum(jnp.prod(jnp.stack(values), axis=0), 0.0) ** (1 / len(maps))
 
     if max_height:
-        return transporter.normalise(product(topdown.max_height))
-    colors, seen, heights = (product(of) for of in (lambda one: one.features[..., :3], lambda one: one.count > 0, lambda one: one.height))
-    slices = transporter.normalise_slices(colors, seen, heights)
-    return slices if maps[0].surface is None else jnp.concatenate([slices, product(lambda one: one.surface)], axis=-1)
+        return transporter.normalise(mean(topdown.max_height))
+    seen = jnp.stack([one.count > 0 for one in maps]).all(0)
+    slices = transporter.normalise_slices(mean(lambda one: one.features[..., :3]), seen, mean(lambda one: one.height))
+    return slices if maps[0].surface is None else jnp.concatenate([slices, mean(lambda one: one.surface)], axis=-1)
 
 
 def imitation(sample: Sample, logits: Heatmaps, *, spec: types.MapSpec) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Give `(loss, metrics)` of one example: cross-entropy of pick and place (eqs. 4-6)."""
-    pick = losses.masked_cross_entropy(logits.pick, sample.pick_valid & sample.drawn)
+    pick = losses.masked_cross_entropy(logits.pick, sample.pick_best & sample.drawn)
     place = losses.place_cross_entropy(logits.place, sample.bins, sample.cells, sample.valid)
     metrics = {"loss_pick": pick, "loss_place": place, "loss": pick + place}
     return pick + place, metrics | hits(sample, logits.pick, logits.place, spec=spec, rotations=len(logits.place))

@@ -135,6 +135,8 @@ def test_one_hot_marks_one_pick_and_the_place_of_least_turn():
         assert np.argwhere(sample.pick_valid).tolist() == np.argwhere(sample.pick_best).tolist() == [sample.pick.tolist()]
         assert sample.valid.sum() == 1
         off = np.abs(transforms.wrap_angle(sample.place.yaw))
+        middle = np.asarray(types.world_from_index(SPEC, sample.pick)) - np.asarray(state.poses[1, :2])
+        assert np.linalg.norm(middle) < max(math.hypot(*2 * [policy.MIDDLE * (0.02 - 0.009)]), SPEC.cell)  # as the oracle picks
         assert off[sample.valid][0] == off.min() <= math.pi / 4 + 1e-5
 
 
@@ -431,30 +433,29 @@ def test_only_slices_show_what_is_under_the_top():
     assert params["pick_net"]["difference"]["stem"]["kernel"].shape[2] == 4 * SPEC.slices + 1
 
 
-def test_the_product_of_two_maps_is_taken_in_their_own_units():
-    """Of colours and heights as they are, cell by cell; so what lies now where the goal is bare table still shows, as it does not
-    once the table is about zero."""
+def test_two_maps_are_seen_as_their_geometric_mean():
+    """In their own units, cell by cell; so what lies now where the goal is bare table still shows, as it would not in a product of
+    normalised maps, in which the table is about zero."""
     state, current, goal = example(0)
     pair = [np.asarray(topdown.max_height(one)) for one in (current, goal)]
     seen = np.asarray(policy.picture(current, goal, max_height=True))
     for row, col in np.ndindex(SPEC.rows, SPEC.cols):
-        times = pair[0][row, col] * pair[1][row, col]
-        wanted = [
-            *(times[:3] - transporter.COLOR_MEAN) / transporter.COLOR_STD,
-            (times[3] - transporter.HEIGHT_MEAN) / transporter.HEIGHT_STD,
-        ]
+        root = [math.sqrt(max(a * b, 0.0)) for a, b in zip(pair[0][row, col], pair[1][row, col], strict=True)]
+        wanted = [(value - transporter.COLOR_MEAN) / transporter.COLOR_STD for value in root[:3]]
+        wanted.append((root[3] - transporter.HEIGHT_MEAN) / transporter.HEIGHT_STD)
         np.testing.assert_allclose(seen[row, col], wanted, rtol=1e-4, atol=1e-4)
     own, bare = tuple(types.index_from_world(SPEC, state.poses[0, :2])), (0, 0)
     assert pair[1][own][3] == pair[0][bare][3] == pytest.approx(0, abs=1e-3)  # the table's height: nothing of either is there
     np.testing.assert_allclose(pair[1][own][:3], TABLE, atol=1e-3)
     assert np.abs(seen[own] - seen[bare])[:3].max() > 1
+    np.testing.assert_allclose(policy.picture(current, current, max_height=True), policy.picture(current, max_height=True), atol=1e-4)
     slices = np.asarray(policy.picture(current, goal, max_height=False))
     both = np.asarray((current.count > 0) & (goal.count > 0))
     assert 0 < both.sum() < np.asarray(goal.count > 0).sum()
     np.testing.assert_array_equal(slices[..., 3:-1:4], both)
     times = np.asarray(current.features[..., :3] * goal.features[..., :3])[both]
     shown = slices[..., :-1].reshape(*both.shape, 4)[both][:, :3]
-    np.testing.assert_allclose(shown * transporter.COLOR_STD + transporter.COLOR_MEAN, times, atol=1e-5)
+    np.testing.assert_allclose((shown * transporter.COLOR_STD + transporter.COLOR_MEAN) ** 2, times, atol=1e-5)
 
 
 def means(metrics):

@@ -58,6 +58,7 @@ class ResNet43_8s(nn.Module):
     width: int = 64
     stages: int = 4
     dtype: jnp.dtype = jnp.float32
+    head_dtype: jnp.dtype | None = None  # of the last pair, `dtype` unless given
 
     @nn.compact
     def __call__(self, x: jax.Array, laterals: Sequence[jax.Array] | None = None) -> tuple[jax.Array, list[jax.Array]]:
@@ -80,7 +81,7 @@ class ResNet43_8s(nn.Module):
                 x = jnp.concatenate([x, laterals[level].astype(x.dtype)], -1)
                 x = nn.Conv(self.width << stage, (1, 1), dtype=self.dtype, name=f"lateral{stage}")(x)
             decoded.append(x)
-        x = residual_pair(x, max(self.width // 4, MIN_HEAD), "head", self.out, last_relu=False, dtype=self.dtype)
+        x = residual_pair(x, max(self.width // 4, MIN_HEAD), "head", self.out, last_relu=False, dtype=self.head_dtype or self.dtype)
         return x, decoded
 
 

@@ -32,6 +32,7 @@ class SpatialStream(nn.Module):
     width: int = 64
     stages: int = 5
     dtype: jnp.dtype = jnp.float32
+    head_dtype: jnp.dtype | None = None  # of the last pair, `dtype` unless given
 
     @nn.compact
     def __call__(self, x: jax.Array) -> tuple[jax.Array, list[jax.Array]]:
@@ -45,7 +46,7 @@ class SpatialStream(nn.Module):
             width = max(self.width << stage >> 1, blocks.MIN_HEAD)
             laterals.append(x := blocks.upsample(blocks.residual_pair(x, width, f"up{stage}", dtype=self.dtype)))
         head = max(self.width // 4, blocks.MIN_HEAD)
-        x = blocks.residual_pair(x, head, "head", self.out, last_relu=False, dtype=self.dtype)
+        x = blocks.residual_pair(x, head, "head", self.out, last_relu=False, dtype=self.head_dtype or self.dtype)
         return x[..., ::2, ::2, :], laterals
 
 
@@ -67,6 +68,7 @@ class SemanticStream(nn.Module):
     width: int = 64
     dtype: jnp.dtype = jnp.float32
     text_layer: bool = True
+    head_dtype: jnp.dtype | None = None  # of the last layer, `dtype` unless given
 
     @nn.compact
     def __call__(self, features: Sequence[jax.Array], laterals: Sequence[jax.Array], sentence: jax.Array) -> jax.Array:
@@ -87,7 +89,7 @@ class SemanticStream(nn.Module):
             level -= 1
             x = blocks.upsample(blocks.residual_pair(x, self._width(level), f"up{level}", dtype=self.dtype))
             x = self._lateral(x, laterals, level)
-        return nn.Conv(self.out, (1, 1), dtype=self.dtype, name="head")(x)[..., ::2, ::2, :]
+        return nn.Conv(self.out, (1, 1), dtype=self.head_dtype or self.dtype, name="head")(x)[..., ::2, ::2, :]
 
     def _width(self, level: int) -> int:
         return max(self.width << level >> 2, blocks.MIN_HEAD)
@@ -117,6 +119,7 @@ class TwoStream(nn.Module):
     stages: int = 5
     dtype: jnp.dtype = jnp.float32
     text_layer: bool = True
+    head_dtype: jnp.dtype | None = None  # of both streams' last layers, `dtype` unless given
 
     def __post_init__(self):
         if self.fusion not in streams.FUSIONS:
@@ -126,8 +129,9 @@ class TwoStream(nn.Module):
     @nn.compact
     def __call__(self, maps: jax.Array, features: Sequence[jax.Array], sentence: jax.Array) -> jax.Array:
         """Map a map `[..., H, W, C]`, features of it `[..., H / s, W / s, c]` and a sentence `[e]` to float32 `[..., H, W, out]`."""
-        spatial, laterals = SpatialStream(self.out, self.width, self.stages, self.dtype, name="spatial")(maps)
-        semantic = SemanticStream(self.out, self.width, self.dtype, self.text_layer, name="semantic")(features, laterals, sentence)
+        spatial, laterals = SpatialStream(self.out, self.width, self.stages, self.dtype, self.head_dtype, name="spatial")(maps)
+        semantic_net = SemanticStream(self.out, self.width, self.dtype, self.text_layer, self.head_dtype, name="semantic")
+        semantic = semantic_net(features, laterals, sentence)
         if self.fusion == "add":
             return spatial.astype(jnp.float32) + semantic.astype(jnp.float32)
         both = nn.relu(jnp.concatenate([spatial, semantic], -1))
@@ -168,7 +172,7 @@ class Cliport(nn.Module):
 
     def setup(self):
         shared = self.width, self.stages, self.dtype, self.text_layer
-        self.pick_net = TwoStream(1, "add", *shared)
+        self.pick_net = TwoStream(1, "add", *shared, head_dtype=jnp.float32)
         self.key_net = TwoStream(self.channels, "conv", *shared)
         self.query_net = TwoStream(self.channels, "conv", *shared)
 
@@ -219,7 +223,7 @@ class Cliport(nn.Module):
             crop_features = [turned_features(x, pick_cell, stride=_stride(maps, x), **how) for x in features]
         query = self.query(transporter.pick_crops(maps, pick_cell, **how), crop_features, sentence)
         key = self.key(maps, features, sentence)
-        logits = transporter.place_logits(key, query, scale=self.crop**-2 * self.channels**-0.5, method=self.method)
+        logits = transporter.place_logits(key, query, scale=(self.crop * self.crop * self.channels) ** -0.5, method=self.method)
         return logits, {"pick_cell": pick_cell, "key": key, "query": query}
 
     def key(

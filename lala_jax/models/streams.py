@@ -29,6 +29,7 @@ class Streams(nn.Module):
     width: int = 64
     stages: int = 4
     dtype: jnp.dtype = jnp.float32
+    head_dtype: jnp.dtype | None = None  # of the last layers, `dtype` unless given
 
     def __post_init__(self):
         if self.variant not in VARIANTS:
@@ -52,4 +53,4 @@ class Streams(nn.Module):
         return nn.Conv(self.out, (1, 1), dtype=self.dtype, name="fuse")(both).astype(jnp.float32)
 
     def _net(self, name: str) -> blocks.ResNet43_8s:
-        return blocks.ResNet43_8s(self.out, self.width, self.stages, self.dtype, name=name)
+        return blocks.ResNet43_8s(self.out, self.width, self.stages, self.dtype, self.head_dtype, name=name)

@@ -72,8 +72,9 @@ class Transporter(nn.Module):
 
     - "transporter" ignores the goal: Transporter Networks, the control.
     - "image_goal" picks from the product of both images, `pick(both)`, and adds: `key(current) + g(goal)`, `query(crops) + g(goal crops)`
-      (CLIPort, `AttentionImageGoal` and `TransportImageGoal`). The product must be of raw images, normalised afterwards: a normalised
-      table is about zero, and times that nothing is left of what lies where the goal is bare. CLIPort's colours are 0..255 then.
+      (CLIPort, `AttentionImageGoal` and `TransportImageGoal`). The product must be of raw images and normalised afterwards: a normalised
+      table is about zero, and times that nothing is left of what lies where the goal is bare. CLIPort normalises a product by what one
+      image has; `policy.picture` takes its root first, so that these numbers fit.
     - "goal_split" picks without the goal and multiplies: `key(current) * g(goal)`, and `query(current) * g(goal)` of the whole
       map, of which the crops are cut (Ravens, `TransportGoal`; its hourglass also has biases, and strides in the first 1x1).
 
@@ -104,16 +105,16 @@ class Transporter(nn.Module):
         super().__post_init__()
 
     def setup(self):
-        self.pick_net = self._net(1, "add")
+        self.pick_net = self._net(1, "add", jnp.float32)  # in bfloat16 many neighbours have equal logits, and the first of them wins
         self.key_net = self._net(self.channels, "conv")
         self.query_net = self._net(self.channels, "conv")
         if self.variant in ("image_goal", "goal_split"):
             self.goal_net = self._net(self.channels, "conv")
 
-    def _net(self, out: int, fusion: str) -> nn.Module:
+    def _net(self, out: int, fusion: str, head_dtype: jnp.dtype | None = None) -> nn.Module:
         if self.variant in streams.VARIANTS:
-            return streams.Streams(out, self.variant, fusion, self.width, self.stages, self.dtype)
-        return blocks.ResNet43_8s(out, self.width, self.stages, self.dtype)
+            return streams.Streams(out, self.variant, fusion, self.width, self.stages, self.dtype, head_dtype)
+        return blocks.ResNet43_8s(out, self.width, self.stages, self.dtype, head_dtype)
 
     def __call__(
         self,
@@ -165,7 +166,9 @@ class Transporter(nn.Module):
             maps = pick_crops(jnp.concatenate([current, goal], -1).astype(self.dtype), pick_cell, **turns)
             query = self.query(*jnp.split(maps, 2, axis=-1))
             key = self.key(current, goal)
-        scale = self.crop**-2 * self.channels**-0.5
+        scale = (
+            self.crop * self.crop * self.channels
+        ) ** -0.5  # logits of any crop start alike; the public code has no factor, or crop**-2
         logits = place_logits(key, query, scale=scale, method=self.method)
         return logits, {"pick_cell": pick_cell, "key": key, "query": query}
 

@@ -170,7 +170,7 @@ def test_equals_its_formulas_in_numpy():
     how = {"yaw_bins": 4, "crop": 8}
     turned = [cliport.turned_features(jnp.asarray(one), jnp.array(cell), stride=2 << i, **how) for i, one in enumerate(features)]
     for given, place in ((turned, logits["place"]), (seen, place_seen)):
-        expected = reference.places(key, run("query", crops, *given)) / 8**2 / 3**0.5
+        expected = reference.places(key, run("query", crops, *given)) / 8 / 3**0.5
         np.testing.assert_allclose(place, expected, atol=1e-3 * expected.std())
     other, *_ = both(params, maps, features, sentence[::-1], seen)
     assert np.abs(other["pick"] - logits["pick"]).max() > 1e-2 * pick.std()

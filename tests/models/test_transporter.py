@@ -105,7 +105,7 @@ def test_rivals_equal_their_formulas_in_numpy(variant):
     np.testing.assert_allclose(logits["pick"], pick[:, 2:-2, 0], atol=1e-4)
     np.testing.assert_allclose(intermediates["key"], key, atol=1e-4)
     np.testing.assert_allclose(intermediates["query"], query, atol=1e-4)
-    place = reference.places(key, query) / 8**2 / 3**0.5
+    place = reference.places(key, query) / 8 / 3**0.5
     np.testing.assert_allclose(logits["place"], place, atol=1e-3 * place.std())
     again, _ = apply(params, current, goal[::-1], jnp.array(cell), both[::-1])
     assert np.array_equal(again["place"], logits["place"]) == (variant == "transporter")
@@ -192,6 +192,17 @@ def test_maps_are_padded_before_they_are_converted():
     padded = [line.rpartition("(")[2] for line in text.splitlines() if "stablehlo.pad" in line and "(tensor<12x8x4x" in line]
     assert len(padded) == 2 and all(line.startswith("tensor<12x8x4xf32>") for line in padded)
     assert "tensor<12x8x8xbf16>" in text
+
+
+@pytest.mark.parametrize("variant", ["transporter", "two_stream"])
+def test_picks_are_told_apart_in_float32(variant):
+    """Whatever the rest computes in: rounded to bfloat16, many neighbours would be equal and the first of them chosen."""
+    net, params, current, goal = _built(variant=variant, dtype=jnp.bfloat16)
+    pick = np.asarray(jax.jit(net.apply)(params, current, goal, jnp.array([4, 4]))[0]["pick"])
+    rounded = pick.astype(jnp.bfloat16).astype(np.float32)
+    assert (pick != rounded).mean() > 0.9 and len(np.unique(rounded)) < len(np.unique(pick)) == pick.size
+    single = jax.jit(net.clone(dtype=jnp.float32).apply)(params, current, goal, jnp.array([4, 4]))[0]["pick"]
+    np.testing.assert_allclose(pick, single, atol=0.05 * np.std(single))
 
 
 def test_maps_of_any_size_keep_their_cells():
