@@ -3,9 +3,9 @@
 Trains every row of `ROWS` on the same demonstrations with the same number of samples, scores it on the same episodes of the test split, and
 writes `<scale>-<task>.json` (see `common`; a row has `published`, the paper's number or null, `parameters`, `samples` and `train_seconds`
 besides), `<scale>.md`, a table of both tasks as far as they are there, and `<scale>.webp`, the same as bars, to `--out`. The scales are
-`smoke` (every part, scores that mean nothing), `cpu` (the paper's pictures, maps, crops and widths divided by four, so that a row trains
-in half an hour on two cores), `cpu-long` (the same with the paper's number of samples, one to four hours of a core a row) and `paper` (its
-own sizes, optimiser and number of samples, in bfloat16; for a GPU).
+`smoke` (every part, scores that mean nothing), `cpu` (all from the default agent's pictures and maps, half the paper's in each direction,
+by networks of about as many parameters as ours: a row trains in half an hour on two cores) and `paper` (the paper's own sizes and number
+of samples, in bfloat16; for a GPU).
 Runs lie in `--workdir`, runs/table1/<task> unless told, each in <scale>-<row>. Started again, it goes on with the rows that are
 missing, and within a row where its training stopped; `--rows=two-stream,ours` runs only these. The row `cliport-clip` needs CLIP's own
 weights: `--clip=RN50.safetensors --clip-tokenizer=tokenizer.json`, which `clip_file` reads. With `--launcher=slurm` or `local` each row
@@ -47,15 +47,15 @@ VISIBLE = ("model.max_height=false", *HIDDEN[1:])
 COLOR = ("model.max_height=true", "model.multi_action=false")
 ROWS = (
     Entry("ours", "ours, the default agent", family="ours"),
-    Entry("single", "LALA single stream", ("model.name=single", *HIDDEN), published=(13.4, 6.0)),
+    Entry("single", "LALA single stream", ("model.name=single", *HIDDEN), published=(13.4, 6.0), family="one"),
     Entry("two-stream", "LALA two stream", ("model.name=two_stream", *HIDDEN), published=(15.8, 6.3)),
     Entry("lateral", "LALA two stream + lateral", ("model.name=two_stream_lateral", *HIDDEN), published=(0.0, 0.0)),
-    Entry("single-visible", "single stream, height slices", ("model.name=single", *VISIBLE)),
+    Entry("single-visible", "single stream, height slices", ("model.name=single", *VISIBLE), family="one"),
     Entry("two-stream-visible", "two stream, height slices", ("model.name=two_stream", *VISIBLE)),
     Entry("lateral-visible", "two stream + lateral, height slices", ("model.name=two_stream_lateral", *VISIBLE)),
-    Entry("transporter", "Transporter (ignores the goal)", ("model.name=transporter", *COLOR)),
-    Entry("image-goal", "image-goal Transporter", ("model.name=image_goal", *COLOR)),
-    Entry("goal-split", "goal-split Transporter", ("model.name=goal_split", *COLOR)),
+    Entry("transporter", "Transporter (ignores the goal)", ("model.name=transporter", *COLOR), family="one"),
+    Entry("image-goal", "image-goal Transporter", ("model.name=image_goal", *COLOR), family="goal"),
+    Entry("goal-split", "goal-split Transporter", ("model.name=goal_split", *COLOR), family="goal"),
     Entry(
         "cliport",
         "CLIPort, one sentence for the whole tower",
@@ -94,8 +94,7 @@ ROWS = (
     Entry("oracle", "oracle", agent="oracle"),
 )
 LINES = ("blind", "top_view")  # drawn through the bars
-SAMPLES = ("train.steps=2500", "train.batch_size=8")  # the paper's 20 000, eight at a time
-# What every row shares, and what the rows of a family do.
+# What every row shares, and what the rows of a family do. A row of a family that lacks a scale would be another's double there.
 SCALES = {
     "smoke": (
         *("data.directory={config.data.directory}-smoke", "data.demos=3", "train.steps=2", "train.batch_size=2", "eval.episodes=2"),
@@ -103,22 +102,19 @@ SCALES = {
         *("pretrain.steps=2", "pretrain.scenes=2", "pretrain.batch_size=2", "pretrain.window=32"),
     ),
     "cpu": ("data.demos=500", "train.steps=400", "train.batch_size=8", "eval.episodes=100"),
-    "cpu-long": ("data.demos=500", *SAMPLES, "eval.episodes=100"),
     "paper": (
-        *("data.demos=500", *SAMPLES, "train.save_every=1000", "eval.episodes=100", "eval.parallel=4"),
+        *("data.demos=500", "train.steps=2500", "train.batch_size=8", "train.save_every=1000", "eval.episodes=100", "eval.parallel=4"),
         *("camera.height=480", "camera.width=640"),
     ),
 }
-SIZES = {"cpu-long": "cpu"}  # a scale whose families are of another one's sizes
-FEW = {"smoke": 2, "cpu": 50, "cpu-long": 50, "paper": 50}
-QUARTER = ("camera.height=120", "camera.width=160", "map.cell=0.0125")
+FEW = {"smoke": 2, "cpu": 50, "paper": 50}
 PAPER = {
     "smoke": ("model.width=4", "model.stages=2", "camera.stage=stem"),
-    "cpu": (*QUARTER, "model.crop=16", "model.width=16", "pretrain.window=32", "pretrain.patch=4"),
+    "cpu": ("model.crop=32", "model.width=8"),
     "paper": (
         *("map.cell=0.003125", "model.crop=64", "model.channels=3", "model.width=64", "model.dtype=bfloat16"),
-        # As eight samples are taken at a time, the root of eight times the paper's learning rate of 1e-4.
-        *("optim.schedule=constant", "optim.learning_rate=2.83e-4", "optim.weight_decay=0.0"),
+        # As eight samples are taken at a time, eight times the paper's learning rate of 1e-4.
+        *("optim.schedule=constant", "optim.learning_rate=8e-4", "optim.weight_decay=0.0"),
     ),
 }
 OURS = {
@@ -128,9 +124,10 @@ OURS = {
 }
 FAMILIES = {
     "ours": OURS,
+    "one": PAPER | {"cpu": ("model.crop=32", "model.width=12")},  # three hourglasses instead of six: as many parameters
+    "goal": PAPER | {"cpu": ("model.crop=32", "model.width=10")},  # four
     "same": {
         "smoke": (*OURS["smoke"], "model.crop=12"),
-        "cpu": (*QUARTER, "model.crop=12", "model.tokens=352"),
         "paper": ("map.cell=0.003125", "model.crop=48", "model.tokens=2816"),
     },
     "paper": PAPER,
@@ -138,7 +135,7 @@ FAMILIES = {
     # All four stages, to a stride of 32, as in CLIPort.
     "clip": {
         "smoke": ("model.width=4", "model.stages=5", "model.crop=32"),
-        "cpu": (*PAPER["cpu"], "model.stages=5", "model.crop=32"),
+        "cpu": (*PAPER["cpu"], "model.stages=5"),
         "paper": (*PAPER["paper"], "model.stages=5"),
     },
     "graph": {"smoke": ("model.width=8",), "cpu": ("model.width=64",), "paper": ("model.width=64",)},
@@ -189,10 +186,11 @@ def shared(config, scale: str) -> list[str]:
 
 def plan(scale: str, clip: tuple[str, ...] = ()) -> list[Entry]:
     """List the rows with all overrides of a scale: the family's sizes first, then what the row is, then CLIP's files if it needs them."""
-    size = SIZES.get(scale, scale)
     few, files = {True: (f"data.demos={FEW[scale]}",), False: ()}, {True: clip, False: ()}
     return [
-        dataclasses.replace(row, overrides=(*FAMILIES[row.family][size], *few[row.few], *row.overrides, *files[row.clip])) for row in ROWS
+        dataclasses.replace(row, overrides=(*FAMILIES[row.family][scale], *few[row.few], *row.overrides, *files[row.clip]))
+        for row in ROWS
+        if scale in FAMILIES[row.family]
     ]
 
 

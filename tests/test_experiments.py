@@ -357,7 +357,7 @@ def test_a_wrong_request_ends_with_one_message(tmp_path, capsys):
         (robustness.command, [f"--checkpoint={tmp_path}"], "no checkpoint"),
         (ablation.command, ["--task=castle"], "--task must be one of 'pallet', 'tower', got 'castle'"),
         (main_table.command, ["--demos=many"], "--demos must be whole numbers"),
-        (table1.command, ["--scale=big"], "--scale must be one of 'smoke', 'cpu', 'cpu-long', 'paper', got 'big'"),
+        (table1.command, ["--scale=big"], "--scale must be one of 'smoke', 'cpu', 'paper', got 'big'"),
     ]:
         with pytest.raises(SystemExit, match="2"):
             command(arguments)
