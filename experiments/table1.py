@@ -4,8 +4,8 @@ Trains every row of `ROWS` on the same demonstrations with the same number of sa
 writes `<scale>-<task>.json` (see `common`; a row has `published`, the paper's number or null, `parameters`, `samples` and `train_seconds`
 besides), `<scale>.md`, a table of both tasks as far as they are there, and `<scale>.webp`, the same as bars, to `--out`. The scales are
 `smoke` (every part, scores that mean nothing), `cpu` (all from the default agent's pictures and maps, half the paper's in each direction,
-by networks of about as many parameters as ours: a row trains in half an hour on two cores) and `paper` (the paper's own sizes and number
-of samples, in bfloat16; for a GPU).
+by networks of about as many parameters as ours, pretrained features to the stem only: a row trains in half an hour on two cores) and
+`paper` (the paper's own sizes and number of samples, in bfloat16; for a GPU).
 Runs lie in `--workdir`, runs/table1/<task> unless told, each in <scale>-<row>. Started again, it goes on with the rows that are
 missing, and within a row where its training stopped; `--rows=two-stream,ours` runs only these. The row `cliport-clip` needs CLIP's own
 weights: `--clip=RN50.safetensors --clip-tokenizer=tokenizer.json`, which `clip_file` reads. With `--launcher=slurm` or `local` each row
@@ -47,13 +47,13 @@ VISIBLE = ("model.max_height=false", *HIDDEN[1:])
 COLOR = ("model.max_height=true", "model.multi_action=false")
 ROWS = (
     Entry("ours", "ours, the default agent", family="ours"),
-    Entry("single", "LALA single stream", ("model.name=single", *HIDDEN), published=(13.4, 6.0), family="one"),
+    Entry("single", "LALA single stream", ("model.name=single", *HIDDEN), published=(13.4, 6.0), family="single"),
     Entry("two-stream", "LALA two stream", ("model.name=two_stream", *HIDDEN), published=(15.8, 6.3)),
     Entry("lateral", "LALA two stream + lateral", ("model.name=two_stream_lateral", *HIDDEN), published=(0.0, 0.0)),
-    Entry("single-visible", "single stream, height slices", ("model.name=single", *VISIBLE), family="one"),
+    Entry("single-visible", "single stream, height slices", ("model.name=single", *VISIBLE), family="single"),
     Entry("two-stream-visible", "two stream, height slices", ("model.name=two_stream", *VISIBLE)),
     Entry("lateral-visible", "two stream + lateral, height slices", ("model.name=two_stream_lateral", *VISIBLE)),
-    Entry("transporter", "Transporter (ignores the goal)", ("model.name=transporter", *COLOR), family="one"),
+    Entry("transporter", "Transporter (ignores the goal)", ("model.name=transporter", *COLOR), family="transporter"),
     Entry("image-goal", "image-goal Transporter", ("model.name=image_goal", *COLOR), family="goal"),
     Entry("goal-split", "goal-split Transporter", ("model.name=goal_split", *COLOR), family="goal"),
     Entry(
@@ -110,7 +110,7 @@ SCALES = {
 FEW = {"smoke": 2, "cpu": 50, "paper": 50}
 PAPER = {
     "smoke": ("model.width=4", "model.stages=2", "camera.stage=stem"),
-    "cpu": ("model.crop=32", "model.width=8"),
+    "cpu": ("model.crop=32", "model.width=8", "camera.stage=stem"),  # deeper features take three times as long
     "paper": (
         *("map.cell=0.003125", "model.crop=64", "model.channels=3", "model.width=64", "model.dtype=bfloat16"),
         # As eight samples are taken at a time, eight times the paper's learning rate of 1e-4.
@@ -124,18 +124,23 @@ OURS = {
 }
 FAMILIES = {
     "ours": OURS,
-    "one": PAPER | {"cpu": ("model.crop=32", "model.width=12")},  # three hourglasses instead of six: as many parameters
+    "single": PAPER | {"cpu": (*PAPER["cpu"], "model.width=12")},  # three hourglasses instead of six: as many parameters
+    "transporter": PAPER | {"cpu": ("model.crop=32", "model.width=12")},
     "goal": PAPER | {"cpu": ("model.crop=32", "model.width=10")},  # four
     "same": {
         "smoke": (*OURS["smoke"], "model.crop=12"),
         "paper": ("map.cell=0.003125", "model.crop=48", "model.tokens=2816"),
     },
     "paper": PAPER,
-    "cliport": {"smoke": ("model.width=4", "model.stages=3"), **{scale: PAPER[scale] for scale in ("cpu", "paper")}},
+    "cliport": {
+        "smoke": ("model.width=4", "model.stages=3"),
+        "cpu": ("model.crop=32", "model.width=8"),
+        "paper": (*PAPER["paper"], "model.stages=5"),
+    },
     # All four stages, to a stride of 32, as in CLIPort.
     "clip": {
         "smoke": ("model.width=4", "model.stages=5", "model.crop=32"),
-        "cpu": (*PAPER["cpu"], "model.stages=5"),
+        "cpu": ("model.crop=32", "model.width=8", "model.stages=5"),
         "paper": (*PAPER["paper"], "model.stages=5"),
     },
     "graph": {"smoke": ("model.width=8",), "cpu": ("model.width=64",), "paper": ("model.width=64",)},

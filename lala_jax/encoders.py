@@ -43,8 +43,8 @@ def load(task_name: str, count: int, *, weights: str = "", tokenizer: str = "", 
         raise options.OptionsError(f"model.name 'cliport' is not installed: {error}") from error
     palette = np.array(list(base.COLORS.values()), np.float32) / 255
     seen, words = jax.tree.map(jnp.asarray, (seen, words))
-    centre = policy_cliport.mean_sentence(encoder, words, template, colors=len(palette))
-    frozen = policy_cliport.Frozen(seen, words, template, jnp.asarray(palette), centre)
+    statistics = policy_cliport.sentence_statistics(encoder, words, template, colors=len(palette))
+    frozen = policy_cliport.Frozen(seen, words, template, jnp.asarray(palette), *map(jnp.asarray, statistics))
     return {"trunk": trunk, "encoder": encoder, "weights": frozen}
 
 

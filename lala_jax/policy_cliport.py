@@ -15,7 +15,8 @@ from lala_jax import policy, types
 from lala_jax.models import bert, clip, cliport, resnet, transporter
 from lala_jax.perception import topdown
 
-ORDERS = 3  # of all colours, whose turns give the sentences that `mean_sentence` averages
+ORDERS = 47  # of all colours, whose turns give the sentences of `sentence_statistics`
+FLOOR = 0.01  # added to the variance of every direction, of which the mean is one
 
 
 @struct.dataclass
@@ -26,7 +27,8 @@ class Frozen:
     encoder: Any  # variables of a `bert.Bert` or a `Sentence`
     template: Any  # of the task's sentence, such as a `wording.Template`: `slots` `[N, K]`, and `fill` from `[N]` to ids and mask `[T]`
     palette: jax.Array  # [P, 3] RGB 0..1, the colours by the indices that the template takes
-    centre: jax.Array  # [e] what `mean_sentence` gives
+    centre: jax.Array  # [e] what `sentence_statistics` gives
+    whiten: jax.Array  # [e, e]
 
 
 class Trunk(resnet.ResNet50):
@@ -63,21 +65,24 @@ def towers(net: clip.Clip, variables: Any, *, stages: int) -> tuple[clip.Visual,
     return trunk, seen, Sentence(net.text), {"params": {"text": variables["params"]["text"]}}
 
 
-def mean_sentence(encoder: bert.Bert | Sentence, variables: Any, template: Any, *, colors: int, seed: int = 0) -> jax.Array:
-    """Give the mean embedding `[e]` of sentences in which each of P `colors` is as often at every place as any other.
+def sentence_statistics(
+    encoder: bert.Bert | Sentence, variables: Any, template: Any, *, colors: int, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Give the mean embedding `[e]` of sentences and the symmetric `[e, e]` that makes the entries of what is left uncorrelated.
 
-    `ORDERS` random orders are turned by 0 to P - 1, and the first N of each taken. MiniLM's mean of all towers of five is met
-    to 0.009 by these 33 sentences, as by 256 random ones (0.013; towers are 0.28 from it on average).
+    In the sentences each of P `colors` is as often at every place as any other: `ORDERS` random orders are turned by 0 to P - 1, and the
+    first N of each taken. What varies less than `FLOOR` is not blown up. The symmetric root has one value, on whatever machine.
     """
     rng, count = np.random.default_rng(seed), template.slots.shape[0]
     orders = [rng.permutation(colors) for _ in range(ORDERS)]
     chosen = jnp.array([np.roll(order, turn)[:count] for order in orders for turn in range(colors)])
-
-    @jax.jit
-    def embed(variables, template):
-        return jnp.asarray(encoder.apply(variables, *template.fill(chosen))).mean(0)
-
-    return embed(variables, template)
+    embed = jax.jit(lambda variables, template: jnp.asarray(encoder.apply(variables, *template.fill(chosen))))
+    embeddings = np.asarray(embed(variables, template), np.float64)
+    centre = embeddings.mean(0)
+    rest = embeddings - centre
+    variances, directions = np.linalg.eigh(np.cov(rest.T, bias=True) / np.square(rest).mean())
+    whiten = directions / np.sqrt(np.maximum(variances, 0.0) + FLOOR) @ directions.T
+    return centre.astype(np.float32), whiten.astype(np.float32)
 
 
 def sentence(encoder: bert.Bert | Sentence, frozen: Frozen, color: jax.Array, height: jax.Array) -> jax.Array:
@@ -87,13 +92,15 @@ def sentence(encoder: bert.Bert | Sentence, frozen: Frozen, color: jax.Array, he
     goals of distractors are under the table.
 
     MiniLM's embeddings have length one, and most of it is what all towers share: those of two orders of the same colours have a cosine
-    of 0.994, of any two towers 0.92. So their mean is subtracted (the cosines are then 0.92 and 0) and the rest scaled to a root mean
-    square of one, what `models.cliport` asks for. A linear map then reads every block's colour without an error.
-    CLIP's are treated likewise, where CLIPort takes them as they come.
+    of 0.994, of any two towers 0.92. So their mean is subtracted (the cosines are then 0.92 and 0). Nearly all that is left says which
+    colours there are, in ten directions; their order is in many small ones, which a network of few steps does not hear. So the entries
+    are whitened, by what `sentence_statistics` says (the cosines are then COS1 and COS2), and scaled to a root mean square of one, what
+    `models.cliport` asks for. CLIP's are treated likewise. CLIPort takes embeddings as they come, and trains a hundred times as long.
     """
     named = jnp.linalg.norm(color[:, None] - frozen.palette, axis=-1).argmin(-1)
     order = jnp.argsort(height)[-frozen.template.slots.shape[0] :]
-    embedding = jnp.asarray(encoder.apply(frozen.encoder, *frozen.template.fill(named[order]))) - frozen.centre
+    rest = jnp.asarray(encoder.apply(frozen.encoder, *frozen.template.fill(named[order]))) - frozen.centre
+    embedding = jnp.matmul(rest, frozen.whiten, precision=jax.lax.Precision.HIGHEST)
     return embedding * jax.lax.rsqrt(jnp.square(embedding).mean() + 1e-12)
 
 

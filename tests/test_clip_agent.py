@@ -87,7 +87,7 @@ def test_it_acts_on_clips_towers(files):
     seen = [clip_reference.visual(tensors(), crop, blocks=SIZES["blocks"]) for crop in crops]
     order = np.argsort(truth.goal[:, 2])
     colors = [np.linalg.norm(PALETTE - np.asarray(truth.color[index]), axis=-1).argmin() for index in order]
-    told = words(colors) - np.asarray(agent.weights.centre)
+    told = (words(colors) - np.asarray(agent.weights.centre)) @ np.asarray(agent.weights.whiten)
     told = told / np.sqrt(np.mean(told**2))
     maps, net = np.pad(np.asarray(transporter.normalise(flat)), black), agent.model.bind({"params": params})
     given = [jnp.asarray(one, jnp.float32) for one in (*features, told)]
@@ -99,12 +99,12 @@ def test_it_acts_on_clips_towers(files):
 
 
 def test_the_sentence_says_the_order(files):
-    """NumPy's embedding of the tokenized sentence, centred and scaled, for colours of one piece and of six; the order changes it."""
+    """NumPy's embedding of the tokenized sentence, whitened and scaled, for colours of one piece and of six; the order changes it."""
     agent = built(files)
     tell = jax.jit(functools.partial(policy_cliport.sentence, agent.encoder))
     found = {}
     for colors in ([1, 5], [5, 1], [NAMES.index("yellow"), NAMES.index("red")]):
-        raw = words(colors) - np.asarray(agent.weights.centre)
+        raw = (words(colors) - np.asarray(agent.weights.centre)) @ np.asarray(agent.weights.whiten)
         found[tuple(colors)] = np.asarray(tell(agent.weights, PALETTE[colors], jnp.array([0.1, 0.2])))
         np.testing.assert_allclose(found[tuple(colors)], raw / np.sqrt(np.mean(raw**2)), atol=1e-3)
     assert np.abs(found[1, 5] - found[5, 1]).max() > 0.05

@@ -76,7 +76,9 @@ def tiny(task_name="tower", count=2):
     shapes = jax.eval_shape(encoder.init, jax.random.key(0), *template.fill(jnp.arange(count)))
     rng = np.random.default_rng(0)
     words = jax.tree.map(lambda leaf: rng.normal(size=leaf.shape).astype(np.float32), shapes)
-    weights = policy_cliport.Frozen(variables, words, template, PALETTE, rng.normal(size=8).astype(np.float32) / 8)
+    weights = policy_cliport.Frozen(
+        variables, words, template, PALETTE, *(rng.normal(size=shape).astype(np.float32) / 8 for shape in (8, (8, 8)))
+    )
     return {"trunk": policy_cliport.Trunk(found.flavour), "encoder": encoder, "weights": weights}
 
 
@@ -144,7 +146,7 @@ def told(color, height, *, encoder, weights):
 def test_the_sentence_names_the_tower_bottom_to_top(distractors):
     """In whatever order the objects come: by name, the lowest first, without those that the goal does not show."""
     task = tasks.get("tower", num_objects=4, distractors=distractors)
-    weights = tiny()["weights"].replace(template=Template(np.zeros((4, 1), np.int32)), centre=np.zeros(6, np.float32))
+    weights = tiny()["weights"].replace(template=Template(np.zeros((4, 1), np.int32)), centre=np.zeros(6, np.float32), whiten=np.eye(6))
     for seed in range(5):
         scene, order = task.sample(seed), np.random.default_rng(seed).permutation(4 + distractors)
         expected = [1] + [NAMES.index(base.color_name(rgb)) + 2 for rgb in scene.color[:4]] + [1]
@@ -152,25 +154,36 @@ def test_the_sentence_names_the_tower_bottom_to_top(distractors):
         np.testing.assert_allclose(found, np.array(expected) / np.sqrt(np.mean(np.square(expected))), rtol=1e-5)
 
 
-def test_the_sentence_is_centred_and_scaled():
-    """Whatever its length, the difference from the mean has a root mean square of one."""
+def test_the_sentence_is_centred_whitened_and_scaled():
+    """Whatever its length, what is made of the difference from the mean has a root mean square of one."""
     encoder, weights = tiny()["encoder"], tiny()["weights"]
     for colors in ([3, 5], [5, 3], [0, 10]):
         raw = np.asarray(encoder.apply(weights.encoder, *weights.template.fill(jnp.array(colors)))) - weights.centre
+        raw = raw @ weights.whiten
         found = told(PALETTE[colors], np.array([0.1, 0.2]), encoder=encoder, weights=weights)
         np.testing.assert_allclose(found, raw / np.sqrt(np.mean(raw**2)), rtol=1e-4, atol=1e-5)
 
 
-def test_the_mean_is_of_sentences_in_balance():
-    """With an encoder that counts which colour stands where, the mean says each everywhere equally often."""
+def test_the_statistics_are_of_sentences_in_balance():
+    """With an encoder that counts which colour stands where, the mean says each everywhere equally often; and of sentences that were not
+    among those, what is whitened has no correlations to speak of, though the encoder says one of the places ten times as loudly."""
 
     class Count:
         def apply(self, variables, ids, mask):
             del variables, mask
-            return jax.nn.one_hot(ids[:, 1:-1] - 2, 11).reshape(len(ids), -1)
+            return (jax.nn.one_hot(ids[:, 1:-1] - 2, 11) * jnp.array([10.0, 1, 1, 1])[:, None]).reshape(len(ids), -1)
 
-    mean = policy_cliport.mean_sentence(Count(), {}, Template(np.zeros((4, 1), np.int32)), colors=11)
-    np.testing.assert_allclose(mean, np.full(44, 1 / 11), rtol=1e-6)
+    template = Template(np.zeros((4, 1), np.int32))
+    mean, whiten = policy_cliport.sentence_statistics(Count(), {}, template, colors=11)
+    np.testing.assert_allclose(mean, np.repeat([10, 1, 1, 1], 11) / 11, rtol=1e-6)
+    np.testing.assert_allclose(whiten, whiten.T, atol=1e-6)
+    rng = np.random.default_rng(5)
+    others = Count().apply({}, *template.fill(jnp.array([rng.permutation(11)[:4] for _ in range(4000)])))
+    rest = (np.asarray(others) - mean) @ whiten
+    loud, quiet = (np.square(rest.reshape(-1, 4, 11)[:, place]).mean() for place in (0, 1))
+    assert 0.5 < quiet / loud < 2
+    blunt = policy_cliport.sentence_statistics(Count(), {}, template, colors=11, seed=1)[1]  # other sentences say about the same
+    assert np.abs(blunt - whiten).max() < 0.2 * np.abs(whiten).max()
 
 
 def test_only_colours_and_order_are_told():
@@ -374,7 +387,7 @@ needs_language = pytest.mark.skipif(not LANGUAGE, reason="needs the extra langua
 def test_the_tokens_are_those_of_the_tasks_sentence(count, distractors):
     language = pytest.importorskip("lala_jax.language")
     task, template = tasks.get("tower", num_objects=count, distractors=distractors), language.template("tower", count)
-    weights = tiny()["weights"].replace(template=template, centre=jnp.zeros(template.ids.shape))
+    weights = tiny()["weights"].replace(template=template, centre=jnp.zeros(template.ids.shape), whiten=jnp.eye(len(template.ids)))
     tell = jax.jit(functools.partial(policy_cliport.sentence, Echo()))
     for seed in range(8):
         scene = task.sample(seed)

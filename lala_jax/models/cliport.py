@@ -78,7 +78,8 @@ class SemanticStream(nn.Module):
         x = nn.relu(self._conv(self._width(level), 3, "stem")(x))
         text = nn.Dense(16 * self.width, dtype=self.dtype, name="text")(sentence) if self.text_layer else sentence
         for skip in reversed(skips):
-            x = x * nn.Dense(x.shape[-1], dtype=self.dtype, name=f"language{level}")(text)
+            gate = nn.Dense(x.shape[-1], dtype=self.dtype, bias_init=nn.initializers.ones, name=f"language{level}")
+            x = x * gate(text)
             level -= 1
             x = jnp.concatenate([skip.astype(x.dtype), blocks.upsample(x)], -1)
             for index, width in enumerate((2 * self._width(level), self._width(level))):
