@@ -94,7 +94,7 @@ def sentence(encoder: bert.Bert | Sentence, frozen: Frozen, color: jax.Array, he
     MiniLM's embeddings have length one, and most of it is what all towers share: those of two orders of the same colours have a cosine
     of 0.994, of any two towers 0.92. So their mean is subtracted (the cosines are then 0.92 and 0). Nearly all that is left says which
     colours there are, in ten directions; their order is in many small ones, which a network of few steps does not hear. So the entries
-    are whitened, by what `sentence_statistics` says (the cosines are then COS1 and COS2), and scaled to a root mean square of one, what
+    are whitened, by what `sentence_statistics` says (the cosines are then 0.56 and 0), and scaled to a root mean square of one, what
     `models.cliport` asks for. CLIP's are treated likewise. CLIPort takes embeddings as they come, and trains a hundred times as long.
     """
     named = jnp.linalg.norm(color[:, None] - frozen.palette, axis=-1).argmin(-1)

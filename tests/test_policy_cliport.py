@@ -415,7 +415,7 @@ def test_orders_of_the_same_colours_are_told_apart():
         return (rows @ rows.T)[np.triu_indices(len(rows), 1)].mean()
 
     assert cosine(raw[:16]) > 0.99 and cosine(raw[16:]) > 0.9
-    assert cosine(new[:16]) < 0.95 and abs(cosine(new[16:])) < 0.1
+    assert cosine(new[:16]) < 0.65 and abs(cosine(new[16:])) < 0.1
     assert sum(leaf.size for leaf in jax.tree.leaves(weights.encoder)) == 22_565_376
 
 
