@@ -32,7 +32,7 @@ ROWS = (
     Lever("default", "default"),
     Lever("default-again", "default, trained once more"),  # as far as the order of sums lets it differ: on one thread or two
     Lever("max-height", "max-height map instead of slices", ("model.max_height=true",)),
-    Lever("one-hot", "one-hot labels", ("model.multi_action=false",)),
+    Lever("one-hot", "one-hot labels", ("model.multi_action=false",), revision=1),
     Lever("matching", "no matching between the maps", ("model.matching=false",)),
     Lever("recolor", "no recolouring", ("augment.recolor=false",)),
     Lever("rigid", "no rigid motion", ("augment.rigid=false",)),
@@ -61,6 +61,7 @@ def main(
     launcher: str, launcher_options: str,
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Train and score a task's config with the levers of `ROWS`."""
+    common.check_task(config, task)
     launch = cluster.launcher(launcher, launcher_options)
     base = budget(config, steps=steps, demos=demos, start=start, episodes=episodes, seed=seed)
     seeds, runs = build.split_seeds("val", start, episodes), pathlib.Path(build.workdir(config, workdir))
@@ -90,8 +91,8 @@ def run(row: Lever, *, base, runs: pathlib.Path, seeds: Sequence[int]) -> dict[s
     """Train where the row has weights of its own, and score."""
     config = row.configs(base)[0]
     if row.trains:
-        return common.train_and_score(config, runs / row.name)
-    params, weights = common.load_weights(str(runs / ROWS[0].name / "checkpoints"), config)
+        return common.train_and_score(config, runs / row.folder)
+    params, weights = common.load_weights(str(runs / ROWS[0].folder / "checkpoints"), config)
     return {**common.row_of(common.score(config, params, seeds)), "train_seconds": 0.0, "weights": weights}
 
 

@@ -39,6 +39,7 @@ FLAGS = {
 def main(config, workdir, *, task: str, stages: str, growth: bool, repeats: int, against: str, limit: float, out: str) -> dict[str, Any]:
     """Time the stages of a task, and compare them with an earlier run's."""
     del workdir
+    common.check_task(config, task)
     every, ceilings = benchmark_stages.STAGES, benchmark_stages.CEILINGS
     known = [name for name in every if name not in ceilings]
     wanted = [options.check_choice("--stages", name, known) for name in stages.split(",") if name] or known

@@ -37,6 +37,12 @@ class Row:
     parts: tuple[tuple[str, ...], ...] = ((),)  # further overrides, each for an equal share of the episodes
     tasks: tuple[str, ...] = ()  # () for all
     needs: tuple[str, ...] = ()  # rows whose weights it takes: they come before
+    revision: int = 0  # raised when code changes what the row gives: its older results and runs then no longer count
+
+    @property
+    def folder(self) -> str:
+        """Name the directory of its run."""
+        return f"{self.name}-r{self.revision}" if self.revision else self.name
 
     def changes(self, config) -> list[list[str]]:
         """Give the overrides of each part."""
@@ -90,14 +96,17 @@ def choose(rows: Sequence, names: str, task: str, *, reference: bool = True) -> 
 def identity(row: Row, config, seeds: Sequence[int], *, weights: Mapping[str, Any] | None) -> dict[str, Any]:
     """Say what a row of changes to `config` is the result of; `weights` where it does not train its own."""
     own = options.to_dict(row.configs(config)[0])
-    return writers.plain({"overrides": row.changes(config), "seeds": [seeds[0], seeds[-1]], "checkpoint": weights, "config": own})
+    named = {"overrides": row.changes(config), "revision": row.revision, "seeds": [seeds[0], seeds[-1]]}
+    return writers.plain({**named, "checkpoint": weights, "config": own})
 
 
 def is_same(stored: Mapping[str, Any], wanted: Mapping[str, Any]) -> bool:
     """Say whether a stored row is the result of the wanted identity; what makes no difference may differ, and new fields may be missing."""
     there, here = (build.run_settings(one["config"]) for one in (stored, wanted))
     exact = all(stored[name] == wanted[name] for name in ("overrides", "seeds", "checkpoint"))
-    return exact and all(there[name] == here[name] for name in there.keys() & here.keys())
+    return (
+        exact and stored.get("revision", 0) == wanted["revision"] and all(there[name] == here[name] for name in there.keys() & here.keys())
+    )
 
 
 def fill(
@@ -112,25 +121,33 @@ def fill(
     launch: cluster.Launcher | None = None,
     before: Sequence[Before] = (),
 ) -> list[dict[str, Any]]:
-    """Give the fields of all `rows`; those that are not in the file are run, and the file is written after each.
+    """Give the fields of all `rows`; those that are not in the file are run, and each is added to what the file holds by then.
 
     A row of the file with a row's name and another `identity` is run again and replaced, other rows stay. `finish(done, kept)` may
     add to the rows that are `done`, in the order of `rows`, and gives the file's other fields; `kept` are all rows of the file that are
     results of the same seeds and weights, also those not asked for. With `launch` the rows are run by workers, after what they share,
     `before`; where some are missing in the end, the file holds the others, and SystemExit is raised.
     """
-    stored = {row["name"]: row for row in json.loads(path.read_text())["rows"]} if path.exists() else {}
-    order = list(dict.fromkeys([*stored, *(row.name for row in rows)]))
+    stored = read(path)
+    order = [*stored, *(row.name for row in rows)]
     wanted = {row.name: identity(row, config, seeds, weights=weights) for row in rows}  # of all, before the first is run
     found, done = {name: stored[name] for name, own in wanted.items() if name in stored and is_same(stored[name], own)}, {}
     results = _here(rows, found, run, wanted) if launch is None else _fanned(launch, path, rows, found, run, wanted, before)
     for row, result in results:
-        stored[row.name] = done[row.name] = result | {"label": row.label}
+        done[row.name] = result | {"label": row.label}
         finished = [done[one.name] for one in rows if one.name in done]
-        kept = [one for one in stored.values() if all(one[name] == wanted[row.name][name] for name in ("seeds", "checkpoint"))]
-        ordered = [stored[name] for name in order if name in stored]
-        writers.write_json(path, {**finish(finished, kept), "rows": ordered})
+        with cluster.exclusive(path):
+            stored = read(path) | done  # another command may have written to it
+            kept = [one for one in stored.values() if all(one[name] == wanted[row.name][name] for name in ("seeds", "checkpoint"))]
+            fields = finish(finished, kept)
+            ordered = [stored[name] for name in dict.fromkeys([*order, *stored]) if name in stored]
+            writers.write_json(path, {**fields, "rows": ordered})
     return [done[row.name] for row in rows]
+
+
+def read(path: pathlib.Path) -> dict[str, dict[str, Any]]:
+    """Read the rows of a file by name; none where there is no file."""
+    return {row["name"]: row for row in json.loads(path.read_text())["rows"]} if path.exists() else {}
 
 
 def outcome(row: Row, run: Callable[[Any], Mapping[str, Any]], own: Mapping[str, Any]) -> dict[str, Any]:
@@ -169,6 +186,12 @@ def _fanned(launch, path, rows, found, run, wanted, before) -> Iterator[tuple[Ro
 def shipped_config(flags: Mapping[str, Any]):
     """Give the config that ships for the task that `flags` name."""
     return options.load(f"configs/{options.check_choice('--task', flags['task'], tasks.names())}.py")
+
+
+def check_task(config, task: str) -> None:
+    """Raise OptionsError where `--task`, of which the results are, is not the config's."""
+    if config.task.name != task:
+        raise options.OptionsError(f"--task={task}, but the config is of {config.task.name!r}: give --task={config.task.name}")
 
 
 def train_seconds(workdir: pathlib.Path) -> float:

@@ -27,6 +27,7 @@ def main(
     launcher: str, launcher_options: str,
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Train a task's config for each number of demonstrations and seed, and score on the test split."""
+    common.check_task(config, task)
     launch = cluster.launcher(launcher, launcher_options)
     base = options.override(config, [f"eval.split={split}", f"eval.start={start}", f"eval.episodes={episodes}"])
     scored = build.split_seeds(split, start, episodes)
@@ -60,7 +61,7 @@ def plan(demos: Sequence[int], seeds: Sequence[int]) -> list[common.Row]:
 def run(row: common.Row, *, base, runs: str) -> dict[str, Any]:
     """Train one run and score it."""
     config = row.configs(base)[0]
-    fields = common.train_and_score(config, pathlib.Path(f"{runs}-{row.name}"))
+    fields = common.train_and_score(config, pathlib.Path(f"{runs}-{row.folder}"))
     return {**fields, "demos": config.data.demos, "train_seed": config.seed}
 
 

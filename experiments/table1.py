@@ -17,7 +17,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import importlib
-import json
 import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -87,7 +86,7 @@ ROWS = (
     ),
     Entry("two-stream-multi", "two stream, every right action", ("model.name=two_stream", *HIDDEN, "model.multi_action=true")),
     Entry("ours-same-maps", "ours, from the pictures and maps of the paper's agents", family="same"),
-    Entry("ours-one-hot", "ours, one-hot labels", ("model.multi_action=false",), family="ours"),
+    Entry("ours-one-hot", "ours, one-hot labels", ("model.multi_action=false",), family="ours", revision=1),
     Entry("ours-no-matching", "ours, no matching between the maps", ("model.matching=false",), family="ours"),
     Entry("blind", "blind: places well, ignores identities", agent="blind"),
     Entry("top_view", "sees the goal from right above only, else perfect", agent="top_view"),
@@ -157,6 +156,7 @@ def main(
     launcher: str, launcher_options: str,
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Train and score every row of the table at a scale, and write the table and the bars."""
+    common.check_task(config, task)
     launch = cluster.launcher(launcher, launcher_options)
     options.check_choice("--scale", scale, SCALES)
     base = options.override(config, [*shared(config, scale), f"eval.split={split}", f"eval.start={start}", f"seed={seed}"])
@@ -177,7 +177,7 @@ def main(
     work, path = functools.partial(work_on, base=base, runs=runs, seeds=seeds, task=task), out_path / f"{scale}-{task}.json"
     before = preparations(chosen, base, runs)
     done = common.fill(path, chosen, work, finish, config=base, seeds=seeds, launch=launch, before=before)
-    write(out_path, scale)
+    write(out_path, scale, seeds)
     return done
 
 
@@ -215,7 +215,7 @@ def can_run(row: Entry, clip: tuple[str, ...] = ()) -> bool:
 
 def work_on(row: Entry, *, base, runs: str, seeds: Sequence[int], task: str) -> dict[str, Any]:
     """Train and score a row: its fields, with what was published."""
-    return {**run(row, base, pathlib.Path(f"{runs}-{row.name}"), seeds), "published": row.published[PUBLISHED.index(task)]}
+    return {**run(row, base, pathlib.Path(f"{runs}-{row.folder}"), seeds), "published": row.published[PUBLISHED.index(task)]}
 
 
 def run(row: Entry, base, directory: pathlib.Path, seeds: Sequence[int]) -> dict[str, Any]:
@@ -228,7 +228,7 @@ def run(row: Entry, base, directory: pathlib.Path, seeds: Sequence[int]) -> dict
     last = f"train.eval_every={config.train.steps}", f"train.eval_episodes={min(config.eval.parallel, 4)}"
     config = options.override(config, [*last, "eval.strips=0"])
     if row.scene:
-        config.camera.backbone = backbone(config, directory.with_name(directory.name.removesuffix(row.name) + "backbone"))
+        config.camera.backbone = backbone(config, directory.with_name(directory.name.removesuffix(row.folder) + "backbone"))
     params = jax.eval_shape(build.build_policy(config).init, jax.random.key(0))
     facts = {"parameters": state.parameter_count(params), "samples": config.train.steps * config.train.batch_size}
     return {**common.train_and_score(config, directory), **facts}
@@ -252,19 +252,28 @@ def preparations(rows: Sequence[Entry], base, runs: str) -> list[common.Before]:
 # The table and the bars
 
 
-def stored(out: pathlib.Path, scale: str) -> dict[str, dict[str, dict[str, Any]]]:
-    """Read the finished rows of a scale, in the table's order: `{task: {name: row}}`."""
+def stored(out: pathlib.Path, scale: str, seeds: Sequence[int]) -> dict[str, dict[str, dict[str, Any]]]:
+    """Read the finished rows of a scale, in the table's order: `{task: {name: row}}`, without those of other settings or `seeds`."""
     found = {}
     for task in [name for name in PUBLISHED if name in tasks.names()]:
         path = out / f"{scale}-{task}.json"
-        rows = {row["name"]: row for row in json.loads(path.read_text())["rows"]} if path.exists() else {}
-        found[task] = {row.name: rows[row.name] for row in ROWS if row.name in rows}
+        rows = common.read(path)
+        fresh = {row.name: rows[row.name] for row in plan(scale) if row.name in rows and is_fresh(row, rows[row.name], seeds)}
+        if left := sorted(rows.keys() - fresh.keys()):
+            print(f"left out of the table, as they are of other settings or seeds: {', '.join(left)} in {path}")
+        found[task] = fresh
     return {task: rows for task, rows in found.items() if rows}
 
 
-def write(out: pathlib.Path, scale: str) -> None:
+def is_fresh(row: Entry, result: Mapping[str, Any], seeds: Sequence[int]) -> bool:
+    """Say whether a row of a file is what the table's row would give now, as far as it names that; files of CLIP may be anywhere."""
+    overrides = [text for text in result["overrides"][0] if not (row.clip and text.startswith("model.clip"))]
+    return overrides == list(row.overrides) and result.get("revision", 0) == row.revision and result["seeds"] == [seeds[0], seeds[-1]]
+
+
+def write(out: pathlib.Path, scale: str, seeds: Sequence[int]) -> None:
     """Write `<scale>.md` and `<scale>.webp` from the results of both tasks, and print the table."""
-    rows = stored(out, scale)
+    rows = stored(out, scale, seeds)
     text = table(rows)
     (out / f"{scale}.md").write_text(text + "\n")
     bars(rows, out / f"{scale}.webp")
@@ -305,7 +314,14 @@ def bars(results: Mapping[str, Mapping[str, Mapping[str, Any]]], path: pathlib.P
     for axis, (task, rows) in zip(axes, results.items(), strict=True):
         own = [(place, rows[entry.name]) for place, entry in enumerate(shown) if entry.name in rows]
         places, scores = [place for place, _ in own], [row["score"] for _, row in own]
-        low, high = ([abs(end - row["score"]) for _, row in own for end in [row["interval95"][side] or row["score"]]] for side in (0, 1))
+        low, high = (
+            [
+                abs(end - row["score"])
+                for _, row in own
+                for end in [row["score"] if row["interval95"][side] is None else row["interval95"][side]]
+            ]
+            for side in (0, 1)
+        )
         axis.barh(places, scores, xerr=[low, high], color="tab:blue", ecolor="black", capsize=2)
         published = [(place, row["published"]) for place, row in own if row["published"] is not None]
         if published:

@@ -150,6 +150,7 @@ def run(
                 save(number, current)
             if leaving:
                 break
+            pause = time.time()
             if after(number, current):
-                begin = time.time()
+                begin += time.time() - pause
     return current

@@ -50,7 +50,7 @@ def train_and_evaluate(config, workdir: str) -> dict[str, Any]:
         if run.step > 0 and validation_due(config, int(run.step)) and not parallel.first(lambda: was_validated(out, int(run.step))):
             _validate(config, recipe, run, store, stored, writer)  # the last run was stopped between saving and scoring
         run = _loop(config, recipe, run, states, store, stored, writer, stopped)
-        if int(run.step) < config.train.steps:
+        if int(run.step) < config.train.steps or parallel.anywhere(stopped()):  # in the last step the state is there, its validation not
             raise SystemExit(f"stopped at step {int(run.step)}; the same command goes on from there")
     params = scoring.check_checkpoint(str(store.directory), config, recipe.policy)
     return parallel.first(lambda: final_scores(config, recipe, params, out))

@@ -158,6 +158,32 @@ def test_what_identifies_a_row(tmp_path):
     assert not common.is_same(older["rows"][0], {**older["rows"][0], "seeds": [1, 7]})
 
 
+def test_a_row_whose_code_changed_runs_again_in_a_directory_of_its_own(tmp_path):
+    path, config = tmp_path / "rows.json", tiny_config()
+    old, new = common.Row("a", "a"), common.Row("a", "a", revision=2)
+    assert filled(path, config, old)[0] == ["a"]
+    older = json.loads(path.read_text())
+    del older["rows"][0]["revision"]  # a file from before there were any
+    path.write_text(json.dumps(older))
+    assert filled(path, config, old)[0] == [] and filled(path, config, new)[0] == ["a"]
+    assert filled(path, config, new)[0] == [] and filled(path, config, old)[0] == ["a"]
+    assert old.folder == "a" and new.folder == "a-r2"
+
+
+def test_two_commands_write_to_one_file(tmp_path):
+    """What another one added while a row ran stays."""
+    path, config = tmp_path / "rows.json", tiny_config()
+
+    def work(row):
+        assert row.name == "a"
+        assert filled(path, config, common.Row("b", "b"))[0] == ["b"]  # meanwhile
+        return {"score": 1.0}
+
+    rows = common.fill(path, [common.Row("a", "a")], work, lambda *_: {}, config=config, seeds=SEEDS)
+    assert [row["name"] for row in rows] == ["a"]
+    assert {row["name"]: row["score"] for row in json.loads(path.read_text())["rows"]} == {"a": 1.0, "b": 50.0}
+
+
 # Numbers
 
 
@@ -244,7 +270,7 @@ def test_the_ablation_trains_each_row_once(trains, monkeypatch, tmp_path, capsys
     given = ["--task=tower", "--steps=5", "--episodes=4", "--seed=2", f"--workdir={tmp_path / 'runs' / '<task>'}", f"--out={tmp_path}"]
     rows = ablation.command([*given, "--rows=one-hot,average-turns"])
     runs = tmp_path / "runs" / "tower"
-    assert [name for name, _ in trains] == [str(runs / "default"), str(runs / "one-hot")]
+    assert [name for name, _ in trains] == [str(runs / "default"), str(runs / "one-hot-r1")]
     assert loaded == [str(runs / "default" / "checkpoints")]
     for _, config in trains:
         assert (config.train.steps, config.train.eval_every, config.seed, config.data.demos) == (5, 5, 2, 500)
@@ -288,6 +314,15 @@ def test_the_table_holds_every_row_of_both_tasks(trains, monkeypatch, tmp_path, 
     assert named["LALA two stream"][4] == "15.8" and named["LALA two stream"][5:] == [""] * 4
     assert named["blind: places well, ignores identities"][1:5] == [""] * 4  # of the tower it was not asked for
     assert len(table1.command([*given, "--rows=two-stream"])) == 1 and len(trains) == 3  # nothing runs again
+    path = tmp_path / "smoke-pallet.json"
+    older = json.loads(path.read_text())
+    older["rows"][0]["overrides"][0].append("model.width=9")
+    older["rows"][1]["seeds"] = [1, 5]
+    path.write_text(json.dumps(older))
+    table1.write(tmp_path, "smoke", [10_001, 10_002])
+    assert "left out of the table, as they are of other settings or seeds: graph, ours in " in capsys.readouterr().out
+    named = [line.split("|")[1].strip() for line in (tmp_path / "smoke.md").read_text().splitlines()[2:]]
+    assert named == [entry.label for entry in table1.ROWS if entry.name in ("two-stream", "blind", "top_view")]
 
 
 def test_bars_are_as_long_as_the_scores(tmp_path):
@@ -297,6 +332,12 @@ def test_bars_are_as_long_as_the_scores(tmp_path):
         pixels = np.asarray(Image.open(tmp_path / "bars.webp").convert("RGB")).astype(int)
         return (np.abs(pixels - (31, 119, 180)).max(-1) < 40).sum()
 
+    def whisker(low):
+        row = {"score": 40.0, "interval95": [low, 80.0], "published": None}
+        table1.bars({"tower": {"ours": row}}, tmp_path / "bars.webp")
+        return (np.asarray(Image.open(tmp_path / "bars.webp").convert("RGB")).astype(int).max(-1) < 60).sum()
+
+    assert whisker(0.0) > whisker(40.0)  # an interval that begins at 0 has a lower end
     assert drawn(80.0, 80.0) == pytest.approx(2 * drawn(40.0, 40.0), rel=0.05)
     assert drawn(80.0, 0.0) == pytest.approx(drawn(40.0, 40.0), rel=0.05)
 
@@ -357,6 +398,9 @@ def test_a_wrong_request_ends_with_one_message(tmp_path, capsys):
         (robustness.command, [], "give --checkpoint=PATH"),
         (robustness.command, [f"--checkpoint={tmp_path}"], "no checkpoint"),
         (ablation.command, ["--task=castle"], "--task must be one of 'pallet', 'tower', got 'castle'"),
+        (ablation.command, ["--config=configs/tower.py"], "--task=pallet, but the config is of 'tower': give --task=tower"),
+        (table1.command, ["--config=configs/pallet.py"], "--task=tower, but the config is of 'pallet': give --task=pallet"),
+        (main_table.command, ["--config=configs/pallet.py"], "--task=tower, but the config is of 'pallet': give --task=pallet"),
         (main_table.command, ["--demos=many"], "--demos must be whole numbers"),
         (table1.command, ["--scale=big"], "--scale must be one of 'smoke', 'cpu', 'paper', got 'big'"),
     ]:

@@ -109,6 +109,29 @@ def test_compiling_is_not_taken_for_the_pace(tmp_path, capsys, monkeypatch):
     assert [row["seconds_per_step"] for row in rows] == [3030.0, 60.0, 60.0]
 
 
+def test_the_pace_counts_steps_and_not_what_comes_between_them(tmp_path, monkeypatch):
+    """Steps of a second, a validation of a hundred between two logs."""
+    clock = itertools.count()
+    now = [0.0]
+    monkeypatch.setattr(loop.time, "time", lambda: now[0])
+
+    def step_time(run):
+        now[0] += 1.0
+        return state.update(run, run.params, optax.sgd(0.5), average_decay=0.5), {"loss": float(next(clock))}
+
+    def after(number, _):
+        now[0] += 100.0 if number in (3, 4) else 0.0
+        return number in (3, 4)
+
+    with writers.Writer(tmp_path, tensorboard=False) as writer:
+        loop.run(
+            lambda _: step_time, fresh(), total=8, log_every=2, save_every=100, save=lambda *_: None, note=str, writer=writer,
+            stopped=lambda: False, after=after,
+        )  # fmt: skip
+    paces = [json.loads(line)["seconds_per_step"] for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert paces == [1.0] * 4
+
+
 def test_a_compiled_step_is_one_program_that_says_what_it_needs(capsys):
     traced = []
 

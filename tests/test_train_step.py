@@ -1,5 +1,6 @@
 """The training step: a pure function of state, data and key, compiled once, resumed bit for bit, loud about what is not finite."""
 
+import contextlib
 import dataclasses
 import functools
 
@@ -157,3 +158,13 @@ def test_the_average_follows_the_parameters():
     assert int(run.step) == 4
     np.testing.assert_allclose(run.params["w"], value, rtol=1e-6)
     np.testing.assert_allclose(run.average["w"], average, rtol=1e-6)
+
+
+def test_a_signal_in_the_last_step_ends_the_command(monkeypatch, tmp_path):
+    """The state is saved, but what was to follow that step is not done: no score is given for a run that has not been validated."""
+    monkeypatch.setattr(train, "load_states", lambda *_: states())
+    monkeypatch.setattr(train, "_loop", lambda config, recipe, run, *_: run.replace(step=np.int32(config.train.steps)))
+    monkeypatch.setattr(train, "final_scores", lambda *_: pytest.fail("scored"))
+    monkeypatch.setattr(loop, "session", lambda out: contextlib.nullcontext((None, lambda: True)))
+    with pytest.raises(SystemExit, match="stopped at step 2; the same command goes on from there"):
+        train.train_and_evaluate(tiny_config(), str(tmp_path))
