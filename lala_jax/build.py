@@ -104,6 +104,15 @@ def surface(config: Mapping[str, Any]) -> int:
     return 64 if stage == "stem" else resnet.layers(stage)[f"{stage}_1/expand"][-1]
 
 
+def backbone_identity(config: Mapping[str, Any]) -> dict[str, str]:
+    """Give the input spec's entry of the surface's features, which tells them from others, whatever file they lie in; {} without any."""
+    if not surface(config):
+        return {}
+    name, stage = config["camera"]["backbone"], config["camera"]["stage"]
+    packaged = name in backbone.PACKAGED
+    return {"surface": f"{name if packaged else f'{checkpoint.crc32(backbone.load(name, stage=stage)[1]):08x}'} {stage}"}
+
+
 def network_dtype(config: Mapping[str, Any]) -> str:
     """Give the type that networks compute in, the backbone among them."""
     return options.check_choice("model.dtype", config["model"].get("dtype", NEWER["model.dtype"]), DTYPES)
@@ -270,9 +279,8 @@ def run_settings(config: Mapping[str, Any]) -> dict[str, Any]:
 def input_spec(config: Mapping[str, Any]) -> dict[str, Any]:
     """Say what the policy expects to see, to be stored beside its parameters."""
     spec = map_spec(config)
-    more = {"surface": f"{config['camera']['backbone']} {config['camera']['stage']}"} if surface(config) else {}
     return {
-        **more,
+        **backbone_identity(config),
         **clip_identity(config),
         "map": {"rows": spec.rows, "cols": spec.cols, "slices": spec.slices, "features": 3},
         "x": list(spec.x), "y": list(spec.y), "z": list(spec.z), "cell": spec.cell,

@@ -219,6 +219,14 @@ def named(tree: Any) -> dict[str, Any]:
     return leaves
 
 
+def crc32(tree: Any) -> int:
+    """Give a checksum of a tree's leaves and their names, whatever their order."""
+    crc = 0
+    for name, leaf in sorted(named(tree).items()):
+        crc = zlib.crc32(np.ascontiguousarray(leaf).reshape(-1).view(np.uint8), zlib.crc32(name.encode(), crc))
+    return crc
+
+
 def _host(name: str, leaf: Any) -> np.ndarray:
     """Bring one leaf to the host, whole."""
     if isinstance(leaf, jax.Array) and jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key):

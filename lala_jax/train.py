@@ -30,7 +30,7 @@ def start_or_resume(config: Mapping[str, Any], recipe: train_step.Recipe, store:
     """Make a fresh state, or restore the newest intact one; raises CheckpointError where it is of a run with other settings."""
     key = jax.random.key(config["seed"], impl="rbg")  # compiles four times faster than the default generator, once a layer
     fresh = jax.jit(lambda key: state.create(recipe.policy.init(key), recipe.optimizer))(key)
-    frozen = build.clip_identity(config)
+    frozen = build.clip_identity(config) | build.backbone_identity(config)
     return loop.start_or_resume(fresh, store, config, build.run_settings, frozen, mesh=recipe.mesh, shard=recipe.shard_state)
 
 

@@ -247,6 +247,26 @@ def test_only_transporters_take_a_backbone():
     assert "surface" not in build.input_spec(defaults.get("", task="tower"))
 
 
+def test_a_backbone_in_a_file_is_told_by_what_it_holds(tmp_path):
+    """Not by where it lies: the same file elsewhere is the same, other values or a deeper stage at the same place are not."""
+    module, variables = backbone.load("resnet50_imagenet_v1", stage="conv2")
+
+    def saved(place, scale=1.0):
+        place.parent.mkdir(exist_ok=True)
+        changed = jax.tree.map(lambda leaf: leaf * np.float32(scale), variables)
+        backbone.save(place, module, changed)
+        return place
+
+    def told(file, stage="conv2"):
+        fields = [f"camera.backbone={file}", f"camera.stage={stage}", "model.name=two_stream"]
+        return build.input_spec(options.override(defaults.get("", task="tower"), fields))["surface"]
+
+    first = told(saved(tmp_path / "a.npz"))
+    assert first.endswith(" conv2") and first == told(saved(tmp_path / "there" / "b.npz"))
+    assert told(tmp_path / "a.npz", "stem") != first
+    assert told(saved(tmp_path / "a.npz", 1.001)) != first
+
+
 def test_a_missing_camera_must_be_there():
     for missing in (4, -2):
         with pytest.raises(options.OptionsError, match=f"camera.missing must be one of -1, 0, 1, 2, 3, got {missing}"):
