@@ -73,14 +73,8 @@ def recordings(rows: Sequence[Row], config) -> list[Before]:
         if len(pairs) > 1:
             largest = max((own for _, own in pairs), key=lambda own: own.data.demos)
             names = tuple(name for name, _ in pairs)
-            found.append(Before(f"demonstrations in {directory}", functools.partial(record, largest), names))
+            found.append(Before(f"demonstrations in {directory}", functools.partial(recording.collect, largest, quiet=True), names))
     return found
-
-
-def record(config) -> None:
-    """Record the demonstrations of a config, alone: the worker of a command that was killed may still be at it."""
-    with cluster.exclusive(pathlib.Path(config.data.directory)):
-        recording.collect(config, quiet=True)
 
 
 def choose(rows: Sequence, names: str, task: str, *, reference: bool = True) -> list:

@@ -24,22 +24,31 @@ MIN_SCORE = 99.0  # a demonstration below is not kept
 def collect(config: Mapping[str, Any], *, quiet: bool = False, launch: cluster.Launcher | None = None) -> pathlib.Path:
     """Complete the dataset of the config to `data.demos` demonstrations of train seeds and give its directory.
 
-    Goes on where an earlier run stopped; a directory that has enough is left alone. With `launch` workers record the shards, and the
-    files are the same. Raises `dataset.DatasetError` where the directory holds another task, `options.OptionsError` where the train
-    split runs out of seeds.
+    Goes on where an earlier run stopped, and waits for another that is at it; a directory that has enough is left alone. With `launch`
+    workers record the shards, and the files are the same. Raises `dataset.DatasetError` where the directory holds another task,
+    `options.OptionsError` where the train split runs out of seeds.
     """
-    task, wanted = build.task(config), config["data"]["demos"]
-    directory = pathlib.Path(config["data"]["directory"])
-    identity = {"task": task.name, "task_options": build.task_options(config)}
+    directory, identity = pathlib.Path(config["data"]["directory"]), _identity(config)
     done = dataset.seeds(directory)
     if done.size:
         dataset.load(directory, count=1, **identity)  # refuses another task before anything is written
+    if len(done) < config["data"]["demos"]:
+        with cluster.exclusive(directory):
+            _complete(config, directory, quiet=quiet, launch=launch)
+    return directory
+
+
+def _identity(config: Mapping[str, Any]) -> dict[str, Any]:
+    return {"task": build.task(config).name, "task_options": build.task_options(config)}
+
+
+def _complete(config: Mapping[str, Any], directory: pathlib.Path, *, quiet: bool, launch: cluster.Launcher | None) -> None:
+    """Record what the directory lacks."""
+    done, wanted, identity = dataset.seeds(directory), config["data"]["demos"], _identity(config)
     kept, place = len(done), (int(done.max()) // 2 + 1 if done.size else 0)
-    if kept >= wanted:
-        return directory
     columns = (*progress.Progress.get_default_columns(), progress.MofNCompleteColumn())
     with progress.Progress(*columns, disable=quiet or launch is not None) as bar:
-        shown = bar.add_task(f"demonstrations of {task.name}", total=wanted, completed=kept)
+        shown = bar.add_task(f"demonstrations of {identity['task']}", total=wanted, completed=kept)
         while kept < wanted:
             shards = plan(place, wanted - kept if launch is not None else min(SHARD, wanted - kept))
             for seeds, demos in _record(config, shards, launch):
@@ -51,8 +60,7 @@ def collect(config: Mapping[str, Any], *, quiet: bool = False, launch: cluster.L
                 kept += len(demos)
                 bar.update(shown, completed=kept)
     if launch is not None:
-        shutil.rmtree(_parts(directory))
-    return directory
+        shutil.rmtree(_parts(directory), ignore_errors=True)
 
 
 def plan(place: int, count: int) -> list[list[int]]:

@@ -1,5 +1,9 @@
 """Closed loop with the real primitive: the oracle solves, the blind agent does not, failures are counted and named."""
 
+import functools
+import threading
+import time
+
 import jax
 import numpy as np
 import pytest
@@ -217,3 +221,21 @@ def test_a_distractor_is_never_lost():
     episode = told(scene, ("wrong object", 1, moved(scene.start, 1, 0.1), [False, True]))
     assert rollout.lost_objects(episode) == ["never moved"]
     assert rollout.summary([episode])["first_failures"]["wrong object"] == 1
+
+
+def test_two_collections_of_one_directory_take_turns(tmp_path, monkeypatch):
+    """Who comes second waits, and finds that nothing is left to do."""
+    monkeypatch.setattr(recording, "demonstrate", functools.partial(slowly, recording.demonstrate))
+    config = options.load("configs/tower.py:smoke", [f"data.directory={tmp_path / 'd'}", "data.demos=2", "task.num_objects=2"])
+    threads = [threading.Thread(target=recording.collect, args=(config,), kwargs={"quiet": True}) for _ in range(2)]
+    for one in threads:
+        one.start()
+    for one in threads:
+        one.join()
+    assert sorted(dataset.seeds(tmp_path / "d")) == [0, 2]
+    assert not list(tmp_path.glob("*.lock"))
+
+
+def slowly(call, *args, **kwargs):
+    time.sleep(0.3)
+    return call(*args, **kwargs)
