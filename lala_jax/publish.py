@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from lala_jax import build, checkpoint, options, pretrained, state, writers
+from lala_jax import build, checkpoint, encoders, options, pretrained, state, writers
 
 LARGEST = 12_000_000  # bytes of weights.npz
 LICENCE = "Apache-2.0"
@@ -216,6 +216,16 @@ def _write(out: pathlib.Path, arrays: bytes, card: Mapping[str, Any]) -> None:
             shutil.rmtree(left, ignore_errors=True)
 
 
+def _pretrained(config: Mapping[str, Any]) -> str:
+    """Say what others trained of what the policy sees with and is told by."""
+    camera, model, parts = config["camera"], config["model"], []
+    if camera.get("backbone"):
+        parts = [f"features of {camera['backbone']} ({camera['stage']})"]
+    if model["name"] == "cliport":
+        parts = [f"CLIP's towers ({model['clip']})"] if model.get("clip") else [f"features of {encoders.TRUNK}", "MiniLM's sentences"]
+    return f"but frozen pretrained parts: {', '.join(parts)}" if parts else "no pretrained parts"
+
+
 def model_card(card: Mapping[str, Any]) -> str:
     """Write a card for people: what this is, from what, how good, and what it cannot do."""
     data, training, spec = card["data"], card["training"], card["input_spec"]["map"]
@@ -244,7 +254,8 @@ def model_card(card: Mapping[str, Any]) -> str:
         "```bash\n" + card["commands"]["evaluate"] + "\n```",
         "repeats the first score below and says whether it is the same.",
         "## Data and training",
-        f"{data['demonstrations']} demonstrations of the scripted oracle in simulation; no other data, no pretrained parts.{spoiled} Their "
+        f"{data['demonstrations']} demonstrations of the scripted oracle in simulation; no other data, {_pretrained(card['config'])}."
+        f"{spoiled} Their "
         f"seeds: {data['seeds']}. Training seed {training['seed']}. The checkpoint was chosen by {training['selection']}.",
         "```bash\n" + card["commands"]["train"] + "\n```",
         "## Scores",

@@ -331,6 +331,18 @@ def test_the_command(run, tmp_path, call):
         refused(call("lala_jax.publish", *arguments), message)
 
 
+def test_the_card_names_what_others_trained():
+    card = pretrained.card("pretrained/tower")
+    for changes, told in (
+        ({}, "no other data, no pretrained parts. "),
+        ({"camera": {"backbone": "mine.npz", "stage": "conv2"}}, "but frozen pretrained parts: features of mine.npz (conv2). "),
+        ({"model": {"name": "cliport"}}, "but frozen pretrained parts: features of resnet50_imagenet_v1, MiniLM's sentences. "),
+        ({"model": {"name": "cliport", "clip": "RN50.npz"}}, "but frozen pretrained parts: CLIP's towers (RN50.npz). "),
+    ):
+        config = {**card["config"], **{group: card["config"][group] | own for group, own in changes.items()}}
+        assert told in publish.model_card(card | {"config": config})
+
+
 def test_the_weights_in_the_package_are_whole():
     """Every task has some: they load, fit the config, are small, and have all three files."""
     assert pretrained.names() == sorted(tasks.names())
