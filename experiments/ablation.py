@@ -3,8 +3,8 @@
 Each row of `ROWS` trains `configs/<task>.py` with one lever moved, all with the same budget, and is scored on val episodes. Writes
 `ablation-<task>.json` (see `common`; each row's `difference` is its score less the first row's, `train_seconds` as the training curve
 says) to `--out`, and prints a table. Runs lie in `--workdir`, runs/ablation/<task> unless told. Started again, it goes on with the
-rows that are missing, and within a row where its training stopped; `--rows=refine,recolor` runs only these. With `--launcher=slurm` or
-`local` each row is a worker's (see `lala_jax.cluster`), after one recorded the demonstrations that rows share.
+rows that are missing, and within a row where its training stopped; `--rows=refine,recolor` runs only these and the first. With
+`--launcher=slurm` or `local` each row is a worker's (see `lala_jax.cluster`), after one recorded the demonstrations that rows share.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 Each row of `ROWS` is scored with the same weights (in one row rounded) on the same seeds and compared with the first. Writes
 `robustness-<split>.json` to `--out`, experiments/results/<task> unless told, and prints a table. The file is as `common` says; each
 row's `drop` is the first row's score less its own, and `conditions` is what `lala_jax.publish --robustness` reads. Started again, it
-goes on with the rows that are missing; `--rows=moved,noise` runs only these. With `--launcher=slurm` or `local` each row is a worker's
-(see `lala_jax.cluster`).
+goes on with the rows that are missing; `--rows=moved,noise` runs only these and the first. With `--launcher=slurm` or `local` each row is
+a worker's (see `lala_jax.cluster`).
 """
 
 from __future__ import annotations

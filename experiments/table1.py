@@ -276,7 +276,10 @@ def write(out: pathlib.Path, scale: str, seeds: Sequence[int]) -> None:
     rows = stored(out, scale, seeds)
     text = table(rows)
     (out / f"{scale}.md").write_text(text + "\n")
-    bars(rows, out / f"{scale}.webp")
+    try:
+        bars(rows, out / f"{scale}.webp")
+    except ModuleNotFoundError as error:
+        print(f"the bars are left out: {error}; pip install matplotlib")
     print(f"\n{text}\n\n{out / scale}.md")
 
 

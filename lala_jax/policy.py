@@ -44,12 +44,15 @@ class Policy(Protocol):
     def loss(
         self, params: Any, key: jax.Array, state: types.State, current: types.TopDownMap, goal: types.TopDownMap
     ) -> tuple[jax.Array, dict[str, jax.Array]]:
-        """Give `(loss, metrics)` of one example."""
+        """Give `(loss, metrics)` of one example; the maps are of the policy's `spec`."""
         ...
 
     @property
     def act(self) -> Callable[..., tuple[types.PickPlace, Heatmaps]]:
-        """Choose an action: `act(params, current, goal)`, and where it is `privileged` `act(params, current, goal, truth)`."""
+        """Choose an action: `act(params, current, goal)`, and where it is `privileged` `act(params, current, goal, truth)`.
+
+        Of two unbatched maps of the policy's `spec`; the action's leaves are `[3]`, `[3]` and `[]`, in the robot's frame.
+        """
         ...
 
 
@@ -72,6 +75,13 @@ def empty_map(spec: types.MapSpec, *, features: int = 3, surface: int = 0) -> ty
         skin=jnp.zeros((*grid[:2], 2)),
         surface=jnp.zeros((*grid[:2], surface)) if surface else None,
     )
+
+
+def check_map(name: str, seen: types.TopDownMap, spec: types.MapSpec) -> None:
+    """Raise ValueError unless a map is of a spec's sizes."""
+    wanted = spec.rows, spec.cols, spec.slices
+    if seen.count.shape != wanted:
+        raise ValueError(f"{name} must be one map of rows, cols and slices {wanted}, made with spec={spec}, got {seen.count.shape}")
 
 
 def argmax_index(logits: jax.Array) -> tuple[jax.Array, ...]:
@@ -338,7 +348,12 @@ class GoalAwarePolicy:
         return jnp.concatenate([jnp.stack([row, col])[None], cells]), jnp.append(turn, turns)
 
     def act(self, params, current: types.TopDownMap, goal: types.TopDownMap) -> tuple[types.PickPlace, Heatmaps]:
-        """Choose an action: the best pick, its best place or that one's quarter turn that fits better, refined below cell and bin."""
+        """Choose an action: the best pick, its best place or that one's quarter turn that fits better, refined below cell and bin.
+
+        Raises ValueError for maps of another spec.
+        """
+        for name, one in (("current", current), ("goal", goal)):
+            check_map(name, one, self.spec)
         variables, model, spec = {"params": params}, self.model, self.spec
         match, layout = self._look(variables, current, goal)
         pick_logits = match.pick

@@ -180,6 +180,14 @@ def check_action(agent, action, heat, current):
     assert abs(transforms.wrap_angle(action.yaw - best[0] * 2 * math.pi / ROTATIONS)) < 0.3 * 2 * math.pi / ROTATIONS
 
 
+def test_maps_of_another_spec_are_refused():
+    agent, (_, current, goal) = POLICIES["goal_aware"], example(0)
+    coarse = policy.empty_map(types.MapSpec(cell=0.025, slices=SPEC.slices))
+    for maps, name in (((coarse, goal), "current"), ((current, coarse), "goal")):
+        with pytest.raises(ValueError, match=rf"{name} must be one map of rows, cols and slices \(80, 40, .*got \(40, 20, "):
+            agent.act({}, *maps)
+
+
 def test_goal_aware_acts_on_the_surface_inside_the_map():
     params, act = compiled("goal_aware")
     _, current, goal = example(0)

@@ -77,7 +77,11 @@ def from_views(
     floor_margin: float = 0.01,
     surface_margin: float = 0.001,
 ) -> types.TopDownMap:
-    """Fuse any number of views of one scene; the map's features are the colour, then the extra per-pixel `features` if given."""
+    """Fuse any number of views of one scene; the map's features are the colour, then the extra per-pixel `features` if given.
+
+    `views.rgb` is `[V, H, W, 3]` in 0..1 and `views.depth` `[V, H, W]` in metres along the camera's z, 0 where nothing was measured; the
+    cameras' poses are in the frame of the map: the robot's base, x forward, z up, the table at z = 0. The margins are those of `fuse`.
+    """
     points = jax.vmap(cameras.unproject)(views.depth, views.camera)
     values = views.rgb if features is None else jnp.concatenate([views.rgb, features], axis=-1)
     return fuse(

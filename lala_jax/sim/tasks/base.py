@@ -165,7 +165,7 @@ class Task:
 
     def build_distractors(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Draw the distractors' sizes `[D, 3]` in metres and symmetries `[D]` in radians."""
-        raise NotImplementedError
+        raise NotImplementedError(f"task {self.name} has no build_distractors: without one it needs distractors=0")
 
     def start_area(self, size: np.ndarray) -> Area:
         """Say where boxes of `size` `[N, 3]` lie at the start."""
