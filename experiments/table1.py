@@ -88,9 +88,9 @@ ROWS = (
     Entry("ours-same-maps", "ours, from the pictures and maps of the paper's agents", family="same"),
     Entry("ours-one-hot", "ours, one-hot labels", ("model.multi_action=false",), family="ours", revision=1),
     Entry("ours-no-matching", "ours, no matching between the maps", ("model.matching=false",), family="ours"),
-    Entry("blind", "blind: places well, ignores identities", agent="blind"),
-    Entry("top_view", "sees the goal from right above only, else perfect", agent="top_view"),
-    Entry("oracle", "oracle", agent="oracle"),
+    Entry("blind", "blind: places well, ignores identities", family="computed", agent="blind"),
+    Entry("top_view", "sees the goal from right above only, else perfect", family="computed", agent="top_view"),
+    Entry("oracle", "oracle", family="computed", agent="oracle"),
 )
 LINES = ("blind", "top_view")  # drawn through the bars
 # What every row shares, and what the rows of a family do. A row of a family that lacks a scale would be another's double there.
@@ -142,6 +142,7 @@ FAMILIES = {
         "cpu": ("model.crop=32", "model.width=8", "model.stages=5"),
         "paper": (*PAPER["paper"], "model.stages=5"),
     },
+    "computed": {scale: () for scale in SCALES},
     "graph": {"smoke": ("model.width=8",), "cpu": ("model.width=64",), "paper": ("model.width=64",)},
 }
 FLAGS = {
