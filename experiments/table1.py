@@ -142,7 +142,7 @@ FAMILIES = {
         "cpu": ("model.crop=32", "model.width=8", "model.stages=5"),
         "paper": (*PAPER["paper"], "model.stages=5"),
     },
-    "computed": {scale: () for scale in SCALES},
+    "computed": dict.fromkeys(SCALES, ()),
     "graph": {"smoke": ("model.width=8",), "cpu": ("model.width=64",), "paper": ("model.width=64",)},
 }
 FLAGS = {
