@@ -166,9 +166,7 @@ class Transporter(nn.Module):
             maps = pick_crops(jnp.concatenate([current, goal], -1).astype(self.dtype), pick_cell, **turns)
             query = self.query(*jnp.split(maps, 2, axis=-1))
             key = self.key(current, goal)
-        scale = (
-            self.crop * self.crop * self.channels
-        ) ** -0.5  # logits of any crop start alike; the public code has no factor, or crop**-2
+        scale = (self.crop * self.crop * self.channels) ** -0.5  # all crops' logits start alike; public code has 1 or crop**-2
         logits = place_logits(key, query, scale=scale, method=self.method)
         return logits, {"pick_cell": pick_cell, "key": key, "query": query}
 
