@@ -97,10 +97,9 @@ def identity(row: Row, config, seeds: Sequence[int], *, weights: Mapping[str, An
 def is_same(stored: Mapping[str, Any], wanted: Mapping[str, Any]) -> bool:
     """Say whether a stored row is the result of the wanted identity; what makes no difference may differ, and new fields may be missing."""
     there, here = (build.run_settings(one["config"]) for one in (stored, wanted))
-    exact = all(stored[name] == wanted[name] for name in ("overrides", "seeds", "checkpoint"))
-    return (
-        exact and stored.get("revision", 0) == wanted["revision"] and all(there[name] == here[name] for name in there.keys() & here.keys())
-    )
+    stored = {"revision": 0, **stored}
+    exact = all(stored[name] == wanted[name] for name in ("overrides", "revision", "seeds", "checkpoint"))
+    return exact and all(there[name] == here[name] for name in there.keys() & here.keys())
 
 
 def fill(

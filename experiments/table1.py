@@ -318,14 +318,8 @@ def bars(results: Mapping[str, Mapping[str, Mapping[str, Any]]], path: pathlib.P
     for axis, (task, rows) in zip(axes, results.items(), strict=True):
         own = [(place, rows[entry.name]) for place, entry in enumerate(shown) if entry.name in rows]
         places, scores = [place for place, _ in own], [row["score"] for _, row in own]
-        low, high = (
-            [
-                abs(end - row["score"])
-                for _, row in own
-                for end in [row["score"] if row["interval95"][side] is None else row["interval95"][side]]
-            ]
-            for side in (0, 1)
-        )
+        ends = [[row["score"] if end is None else end for end in row["interval95"]] for _, row in own]
+        low, high = ([abs(pair[side] - score) for pair, score in zip(ends, scores, strict=True)] for side in (0, 1))
         axis.barh(places, scores, xerr=[low, high], color="tab:blue", ecolor="black", capsize=2)
         published = [(place, row["published"]) for place, row in own if row["published"] is not None]
         if published:

@@ -66,6 +66,11 @@ def task_options(config: Mapping[str, Any]) -> dict[str, Any]:
     return {"num_objects": built.num_objects, "colors": built.colors, **{name: value for name, value in more.items() if value}}
 
 
+def data_identity(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Give what tells the demonstrations of one config from those of another, as `dataset` stores it."""
+    return {"task": task(config).name, "task_options": task_options(config)}
+
+
 def mistakes(config: Mapping[str, Any]) -> float:
     """Give the share of the demonstrations' actions that are spoiled."""
     share = config["data"].get("mistakes", 0.0)  # configs in checkpoints may be older than the field

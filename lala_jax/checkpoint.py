@@ -223,7 +223,7 @@ def crc32(tree: Any) -> int:
     """Give a checksum of a tree's leaves and their names, whatever their order."""
     crc = 0
     for name, leaf in sorted(named(tree).items()):
-        crc = zlib.crc32(np.ascontiguousarray(leaf).reshape(-1).view(np.uint8), zlib.crc32(name.encode(), crc))
+        crc = _crc(leaf, zlib.crc32(name.encode(), crc))
     return crc
 
 
@@ -237,8 +237,8 @@ def _host(name: str, leaf: Any) -> np.ndarray:
     return array
 
 
-def _crc(array: np.ndarray) -> int:
-    return zlib.crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8))
+def _crc(array: np.ndarray, begin: int = 0) -> int:
+    return zlib.crc32(np.ascontiguousarray(array).reshape(-1).view(np.uint8), begin)
 
 
 def _digest(side: Mapping[str, Any]) -> int:

@@ -28,23 +28,19 @@ def collect(config: Mapping[str, Any], *, quiet: bool = False, launch: cluster.L
     workers record the shards, and the files are the same. Raises `dataset.DatasetError` where the directory holds another task,
     `options.OptionsError` where the train split runs out of seeds.
     """
-    directory, identity = pathlib.Path(config["data"]["directory"]), _identity(config)
+    directory, identity = pathlib.Path(config["data"]["directory"]), build.data_identity(config)
     done = dataset.seeds(directory)
     if done.size:
         dataset.load(directory, count=1, **identity)  # refuses another task before anything is written
     if len(done) < config["data"]["demos"]:
         with cluster.exclusive(directory):
-            _complete(config, directory, quiet=quiet, launch=launch)
+            _complete(config, directory, identity, quiet=quiet, launch=launch)
     return directory
 
 
-def _identity(config: Mapping[str, Any]) -> dict[str, Any]:
-    return {"task": build.task(config).name, "task_options": build.task_options(config)}
-
-
-def _complete(config: Mapping[str, Any], directory: pathlib.Path, *, quiet: bool, launch: cluster.Launcher | None) -> None:
+def _complete(config, directory: pathlib.Path, identity: Mapping[str, Any], *, quiet: bool, launch: cluster.Launcher | None) -> None:
     """Record what the directory lacks."""
-    done, wanted, identity = dataset.seeds(directory), config["data"]["demos"], _identity(config)
+    done, wanted = dataset.seeds(directory), config["data"]["demos"]
     kept, place = len(done), (int(done.max()) // 2 + 1 if done.size else 0)
     columns = (*progress.Progress.get_default_columns(), progress.MofNCompleteColumn())
     with progress.Progress(*columns, disable=quiet or launch is not None) as bar:
@@ -74,7 +70,7 @@ def _record(config, shards, launch: cluster.Launcher | None) -> Iterator[tuple[l
         yield from ((seeds, _demonstrations(config, seeds)) for seeds in shards)
         return
     folder, tasks, places, waiting = _parts(pathlib.Path(config["data"]["directory"])), [], {}, collections.deque(shards)
-    key = {"task": config["task"]["name"], "task_options": build.task_options(config)}
+    key = build.data_identity(config)
     for group in np.array_split(np.arange(len(shards)), min(launch.workers, len(shards))):
         own = [shards[index] for index in group]
         name = f"{own[0][0]}-{own[-1][-1]}"

@@ -21,8 +21,7 @@ step = compiling.jit(train_step.train_step, static_argnums=0, donate_argnums=1)
 def load_states(config: Mapping[str, Any], mesh: jax.sharding.Mesh | None = None) -> types.State:
     """Read the demonstrations (collecting them first where there are none) as training states on every device, leaves `[M, ...]`."""
     directory = parallel.first(lambda: recording.collect(config))
-    identity = {"task": config["task"]["name"], "task_options": build.task_options(config)}
-    demos, _ = dataset.load(directory, count=config["data"]["demos"], **identity)
+    demos, _ = dataset.load(directory, count=config["data"]["demos"], **build.data_identity(config))
     return parallel.place(types.State(**dataset.stack(demos)), mesh)
 
 
