@@ -54,6 +54,9 @@ FLAGS = {
     "out": "experiments/results/ablation",
     **cluster.FLAGS,
 }
+ITSELF = "the experiment, alike for all rows"
+FIELDS = {"train.steps": "--steps", "data.demos": "--demos", "seed": "--seed", "eval.start": "--start", "eval.episodes": "--episodes"}
+FIELDS |= dict.fromkeys(("eval.split", "train.eval_every", "train.eval_episodes"), ITSELF)
 
 
 def main(
@@ -105,8 +108,9 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
 def command(argv: Sequence[str] | None = None):
     """Run from the command line."""
     return options.run(
-        main, flags=FLAGS, config_from=common.shipped_config, workdir="runs/ablation/<task>", user_errors=common.USER_ERRORS, argv=argv
-    )
+        main, flags=FLAGS, config_from=common.shipped_config, workdir="runs/ablation/<task>", owned=lambda _: FIELDS,
+        user_errors=common.USER_ERRORS, argv=argv,
+    )  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -2,7 +2,8 @@
 
 Times the stages of `benchmark_stages` at the sizes of `configs/<task>.py`, and with `--growth=true` how some grow with a size; a matrix
 product and a copy of the same run say how much of the machine's own rate a stage reaches, and `benchmark_targets` what it must show.
-Writes `<device>-<task>.json` to `--out` and prints its tables. `--stages=render,fuse` times only these (and the two ceilings).
+Writes `<device>-<task>.json` to `--out` and prints its tables. `--stages=render,fuse` times only these (and the two ceilings); as ratios
+are of one run, it is refused where it would replace a file that holds other stages, too.
 `--against=FILE` compares with an earlier file by ratios of medians, and ends with status 1 where a stage takes more than `--limit`
 times as long. Comparisons that need what is not installed (PyTorch: extra `benchmark`; OpenGL: Debian's libegl1 and libgl1-mesa-dri)
 are left out, and the table says so.
@@ -44,6 +45,10 @@ def main(config, workdir, *, task: str, stages: str, growth: bool, repeats: int,
     known = [name for name in every if name not in ceilings]
     wanted = [options.check_choice("--stages", name, known) for name in stages.split(",") if name] or known
     before = read(against) if against else None
+    kind = "".join(letter if letter.isalnum() else "-" for letter in jax.devices()[0].device_kind.lower())
+    path = pathlib.Path(out) / f"{kind}-{task}.json"
+    if path.exists() and (lost := {row["name"] for row in read(str(path), "--out")["stages"]} - {*ceilings, *wanted}):
+        raise options.OptionsError(f"{path} holds stages that --stages={stages} leaves out: {', '.join(sorted(lost))}; give another --out")
     apart = jax.default_backend() == "cpu"  # a GPU's memory is this process's
     rows = []
     for name in (*ceilings, *wanted):
@@ -56,8 +61,6 @@ def main(config, workdir, *, task: str, stages: str, growth: bool, repeats: int,
     grown = [benchmark_stages.grow(name, config, repeats, apart=apart) for name in benchmark_stages.GROWTH] if growth else []
     targets = [benchmark_targets.judged(target, rows, task, jax.default_backend()) for target in benchmark_targets.TARGETS]
     result = {"task": task, **machine(), "stages": rows, "growth": grown, "targets": targets}
-    kind = "".join(letter if letter.isalnum() else "-" for letter in result["device"].lower())
-    path = pathlib.Path(out) / f"{kind}-{task}.json"
     writers.write_json(path, result)
     parts = [table(rows), *([growth_table(grown)] if grown else []), benchmark_targets.table(targets), str(path)]
     print("".join(f"\n{part}\n" for part in parts))
@@ -114,13 +117,13 @@ def growth_table(grown: Sequence[Mapping[str, Any]]) -> str:
     return common.table(["", "time"], lines)
 
 
-def read(path: str) -> dict[str, Any]:
-    """Read a file of this benchmark; raises OptionsError where it is none."""
+def read(path: str, flag: str = "--against") -> dict[str, Any]:
+    """Read a file of this benchmark; raises OptionsError, naming the flag that led there, where it is none."""
     try:
         found = json.loads(pathlib.Path(path).read_text())
         return {**found, "stages": list(found["stages"])}
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise options.OptionsError(f"--against={path} is no file of this benchmark: {type(error).__name__} {error}") from error
+        raise options.OptionsError(f"{flag}={path} is no file of this benchmark: {type(error).__name__} {error}") from error
 
 
 def slower(before: Mapping[str, Any], after: Mapping[str, Any], limit: float) -> list[str]:

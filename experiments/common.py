@@ -25,6 +25,7 @@ from lala_jax import build, cluster, loop, options, recording, rollout, scoring,
 from lala_jax.sim import tasks
 
 USER_ERRORS = (*build.USER_ERRORS, loop.NonFiniteError)
+CHOOSES = ("eval_every", "eval_episodes")  # fields of `train` by which the checkpoint that is scored is chosen
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,6 +44,10 @@ class Row:
     def folder(self) -> str:
         """Name the directory of its run."""
         return f"{self.name}-r{self.revision}" if self.revision else self.name
+
+    def beside(self, config) -> dict[str, Any]:
+        """Give what else its result depends on: settings of `config` that `build.run_settings` leaves out."""
+        return {}
 
     def changes(self, config) -> list[list[str]]:
         """Give the overrides of each part."""
@@ -91,15 +96,30 @@ def identity(row: Row, config, seeds: Sequence[int], *, weights: Mapping[str, An
     """Say what a row of changes to `config` is the result of; `weights` where it does not train its own."""
     own = options.to_dict(row.configs(config)[0])
     named = {"overrides": row.changes(config), "revision": row.revision, "seeds": [seeds[0], seeds[-1]]}
-    return writers.plain({**named, "checkpoint": weights, "config": own})
+    return writers.plain({**named, "checkpoint": weights, "config": own, "beside": row.beside(config)})
 
 
 def is_same(stored: Mapping[str, Any], wanted: Mapping[str, Any]) -> bool:
     """Say whether a stored row is the result of the wanted identity; what makes no difference may differ, and new fields may be missing."""
-    there, here = (build.run_settings(one["config"]) for one in (stored, wanted))
-    stored = {"revision": 0, **stored}
-    exact = all(stored[name] == wanted[name] for name in ("overrides", "revision", "seeds", "checkpoint"))
-    return exact and all(there[name] == here[name] for name in there.keys() & here.keys())
+    stored = {"revision": 0, "beside": {}, **stored}
+    exact = all(stored[name] == wanted[name] for name in ("overrides", "revision", "seeds", "checkpoint", "beside"))
+    return exact and _alike(stored["config"], wanted["config"])
+
+
+def _alike(there: Mapping[str, Any], here: Mapping[str, Any]) -> bool:
+    """Say whether two configs, one of which may be older than some fields, give the same result."""
+    first, second = (build.run_settings(one) | {name: one["train"].get(name) for name in CHOOSES} for one in (there, here))
+    return all(first[name] == second[name] for name in first.keys() & second.keys())
+
+
+def belongs(stored: Mapping[str, Any], config, seeds: Sequence[int], weights: Mapping[str, Any] | None) -> bool:
+    """Say whether a stored row, whatever its name, is a result of changes to `config`, of these seeds and weights."""
+    try:
+        own = writers.plain(options.to_dict(options.override(config, stored["overrides"][0])))
+    except options.OptionsError:  # it changes a field that is no more
+        return False
+    named = writers.plain({"seeds": [seeds[0], seeds[-1]], "checkpoint": weights})
+    return all(stored[name] == value for name, value in named.items()) and _alike(stored["config"], own)
 
 
 def fill(
@@ -117,9 +137,9 @@ def fill(
     """Give the fields of all `rows`; those that are not in the file are run, and each is added to what the file holds by then.
 
     A row of the file with a row's name and another `identity` is run again and replaced, other rows stay. `finish(done, kept)` may
-    add to the rows that are `done`, in the order of `rows`, and gives the file's other fields; `kept` are all rows of the file that are
-    results of the same seeds and weights, also those not asked for. With `launch` the rows are run by workers, after what they share,
-    `before`; where some are missing in the end, the file holds the others, and SystemExit is raised.
+    add to the rows that are `done`, in the order of `rows`, and gives the file's other fields; `kept` are all rows of the file that
+    belong to the same config, seeds and weights, also those not asked for. With `launch` the rows are run by workers, after what they
+    share, `before`; where some are missing in the end, the file holds the others, and SystemExit is raised.
     """
     stored = read(path)
     order = [*stored, *(row.name for row in rows)]
@@ -131,7 +151,7 @@ def fill(
         finished = [done[one.name] for one in rows if one.name in done]
         with cluster.exclusive(path):
             stored = read(path) | done  # another command may have written to it
-            kept = [one for one in stored.values() if all(one[name] == wanted[row.name][name] for name in ("seeds", "checkpoint"))]
+            kept = [one for one in stored.values() if belongs(one, config, seeds, weights)]
             fields = finish(finished, kept)
             ordered = [stored[name] for name in dict.fromkeys([*order, *stored]) if name in stored]
             writers.write_json(path, {**fields, "rows": ordered})

@@ -20,6 +20,7 @@ from experiments import common
 from lala_jax import build, cluster, compiling, options
 
 FLAGS = {"task": "tower", "demos": "500,50,10", "seeds": "0,1,2", "split": "test", "start": 0, "episodes": 100, "out": "", **cluster.FLAGS}
+FIELDS = {"data.demos": "--demos", "seed": "--seeds"} | {f"eval.{name}": f"--{name}" for name in ("split", "start", "episodes")}
 
 
 def main(
@@ -100,8 +101,9 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
 def command(argv: Sequence[str] | None = None):
     """Run from the command line."""
     return options.run(
-        main, flags=FLAGS, config_from=common.shipped_config, workdir=build.WORKDIR, user_errors=common.USER_ERRORS, argv=argv
-    )
+        main, flags=FLAGS, config_from=common.shipped_config, workdir=build.WORKDIR, owned=lambda _: FIELDS,
+        user_errors=common.USER_ERRORS, argv=argv,
+    )  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -40,6 +40,10 @@ class Entry(common.Row):
     extra: str = ""  # of the package, with a module of that name, that the row needs
     clip: bool = False  # needs CLIP's files
 
+    def beside(self, config) -> dict[str, Any]:
+        """Give how the backbone is pre-trained, where it is."""
+        return build.pretrain_settings(self.configs(config)[0]) if self.scene else {}
+
 
 HIDDEN = ("model.max_height=true", "model.multi_action=false", "camera.backbone=resnet50_imagenet_v1")  # the goal's inside is
 VISIBLE = ("model.max_height=false", *HIDDEN[1:])
@@ -93,6 +97,7 @@ ROWS = (
     Entry("oracle", "oracle", family="computed", agent="oracle"),
 )
 LINES = ("blind", "top_view")  # drawn through the bars
+LAST = ("train.eval_every", "train.eval_episodes", "eval.strips")  # fields that say how a run ends
 # What every row shares, and what the rows of a family do. A row of a family that lacks a scale would be another's double there.
 SCALES = {
     "smoke": (
@@ -185,6 +190,14 @@ def main(
 PUBLISHED = ("tower", "pallet")  # the order in Entry.published
 
 
+def owned(flags: Mapping[str, Any]) -> dict[str, str]:
+    """Give the fields that the scale, its rows and the flags set, and by what."""
+    scale = options.check_choice("--scale", flags["scale"], SCALES)
+    texts = [*SCALES[scale], *(text for row in plan(scale) for text in row.overrides)]
+    ours = dict.fromkeys([*(text.partition("=")[0] for text in texts), *LAST], f"--scale={scale} and its rows")
+    return ours | {"eval.split": "--split", "eval.start": "--start", "seed": "--seed"}
+
+
 def shared(config, scale: str) -> list[str]:
     """Give the overrides of every row at a scale."""
     return [text.format(config=config) for text in SCALES[scale]]
@@ -226,8 +239,8 @@ def run(row: Entry, base, directory: pathlib.Path, seeds: Sequence[int]) -> dict
         summary = scoring.baseline(row.agent, build.task(config), seeds=seeds, threads=config.data.threads)
         return {**common.row_of(summary), "parameters": None, "samples": 0, "train_seconds": 0.0}
     # One validation, of a few episodes: at the paper's scale as many as the scores then take at once, by the same program.
-    last = f"train.eval_every={config.train.steps}", f"train.eval_episodes={min(config.eval.parallel, 4)}"
-    config = options.override(config, [*last, "eval.strips=0"])
+    values = config.train.steps, min(config.eval.parallel, 4), 0
+    config = options.override(config, [f"{name}={value}" for name, value in zip(LAST, values, strict=True)])
     if row.scene:
         config.camera.backbone = backbone(config, directory.with_name(directory.name.removesuffix(row.folder) + "backbone"))
     params = jax.eval_shape(build.build_policy(config).init, jax.random.key(0))
@@ -338,8 +351,9 @@ def bars(results: Mapping[str, Mapping[str, Mapping[str, Any]]], path: pathlib.P
 def command(argv: Sequence[str] | None = None):
     """Run from the command line."""
     return options.run(
-        main, flags=FLAGS, config_from=common.shipped_config, workdir="runs/table1/<task>", user_errors=common.USER_ERRORS, argv=argv
-    )
+        main, flags=FLAGS, config_from=common.shipped_config, workdir="runs/table1/<task>", owned=owned, user_errors=common.USER_ERRORS,
+        argv=argv,
+    )  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -97,6 +97,7 @@ def run(
     flags: Mapping[str, Any] | None = None,
     config_from: Callable[[dict[str, Any]], ml_collections.ConfigDict | Mapping[str, Any]] | None = None,
     workdir: str | None = None,
+    owned: Callable[[dict[str, Any]], Mapping[str, str]] | None = None,
     user_errors: tuple[type[Exception], ...] = (),
     argv: Sequence[str] | None = None,
 ) -> Any:
@@ -108,6 +109,8 @@ def run(
       config_from: gives the config from the flags when `--config` is not given (say, the one stored in a checkpoint);
         `--config.x=y` then changes that one. Without it `--config` is required.
       workdir: default of `--workdir`, which is required without one.
+      owned: gives from the flags the fields that the program sets itself, and the flag, or whatever else, that says to what:
+        `--config.x=y` of one is refused.
       user_errors: exceptions out of `main` that, like OptionsError, end with status 2 and their message alone.
       argv: arguments without the program's name; those of the process by default.
     """
@@ -120,6 +123,7 @@ def run(
         directory = workdir if given["workdir"] is None else given["workdir"]
         if not directory:
             raise OptionsError("--workdir=DIRECTORY is required")
+        _check_owned(given["overrides"], owned(given["flags"]) if owned is not None else {})
         if given["config"] is not None:
             config = load(given["config"], given["overrides"])
         elif config_from is not None:
@@ -130,6 +134,13 @@ def run(
     except (OptionsError, *user_errors) as error:
         print(f"{program}: {error}\n(--help lists the flags, and with --config its fields)", file=sys.stderr)
         raise SystemExit(2) from None
+
+
+def _check_owned(overrides: Iterable[str], owned: Mapping[str, str]) -> None:
+    """Raise OptionsError for overrides that would be overridden themselves."""
+    for text in overrides:
+        if by := owned.get(text.partition("=")[0]):
+            raise OptionsError(f"--config.{text} would have no effect: the field is set by {by}")
 
 
 def _split(text: str) -> tuple[str, str | None]:

@@ -281,8 +281,14 @@ def test_two_files_are_compared_by_ratio(monkeypatch, tmp_path, capsys):
     assert "| a | 1.20 |" in capsys.readouterr().out
     taken["b"] = 3.0
     with pytest.raises(SystemExit, match="1"):
-        benchmark.command(["--task=tower", f"--out={tmp_path}", f"--against={earlier}", "--stages=b"])
+        benchmark.command(["--task=tower", f"--out={tmp_path / 'some'}", f"--against={earlier}", "--stages=b"])
     assert "more than 1.3 times as long: b" in capsys.readouterr().out
+    whole = path.read_bytes()
+    with pytest.raises(SystemExit, match="2"):
+        benchmark.command(["--task=tower", f"--out={tmp_path}", "--stages=b"])
+    said = capsys.readouterr()
+    assert f"{path} holds stages that --stages=b leaves out: a; give another --out" in said.err and not said.out
+    assert path.read_bytes() == whole
     taken["b"] = None
     benchmark.command(["--task=tower", f"--out={tmp_path}", f"--against={earlier}"])
     assert "| b | no b here |" in capsys.readouterr().out

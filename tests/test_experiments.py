@@ -138,6 +138,15 @@ def test_finished_rows_are_kept_and_changed_ones_run_again(tmp_path):
     assert len(stored["rows"]) == 3 and stored["count"] == 1 and stored["kept"] == ["a", "b", "c"]  # what was not asked for stays
     assert filled(path, config, third, weights={"step": 1})[0] == ["c"]
     assert json.loads(path.read_text())["kept"] == ["c"]  # the others are of other weights
+    filled(path, tiny_config("camera.turn=1.0"), first)
+    assert json.loads(path.read_text())["kept"] == ["a"]  # "b" is of other settings
+    filled(path, config, third)
+    assert json.loads(path.read_text())["kept"] == ["b", "c"]
+    older = json.loads(path.read_text())
+    older["rows"][1]["overrides"] = [["model.gone=1"]]
+    path.write_text(json.dumps(older))
+    filled(path, config, first)
+    assert json.loads(path.read_text())["kept"] == ["a", "c"]
 
 
 def test_what_identifies_a_row(tmp_path):
@@ -150,12 +159,22 @@ def test_what_identifies_a_row(tmp_path):
     assert ran() and not ran()
     assert not ran(tiny_config("eval.parallel=3", "data.threads=2", "train.log_every=9"))  # makes no difference
     assert ran(tiny_config("camera.turn=1.0")) and ran()
+    assert ran(tiny_config("train.eval_every=7")) and ran()  # another checkpoint may be the best
     assert ran(weights=weights) and not ran(weights=dict(weights)) and ran(weights={**weights, "crc32": 8}) and ran()
     older = json.loads(path.read_text())
     del older["rows"][0]["config"]["model"]["max_height"]  # the row is older than a field
     path.write_text(json.dumps(older))
     assert not ran()
     assert not common.is_same(older["rows"][0], {**older["rows"][0], "seeds": [1, 7]})
+
+
+def test_a_row_of_a_pretrained_backbone_depends_on_how_that_is_made(tmp_path):
+    named = {row.name: row for row in table1.plan("smoke")}
+    config = options.override(shipped("tower"), table1.shared(shipped("tower"), "smoke"))
+    longer, path = options.override(config, ["pretrain.mask=0.25"]), tmp_path / "rows.json"
+    rows = named["two-stream-scene"], named["two-stream"]
+    assert filled(path, config, *rows)[0] == ["two-stream-scene", "two-stream"] and filled(path, config, *rows)[0] == []
+    assert filled(path, longer, *rows)[0] == ["two-stream-scene"]
 
 
 def test_a_row_whose_code_changed_runs_again_in_a_directory_of_its_own(tmp_path):
@@ -402,6 +421,10 @@ def test_a_wrong_request_ends_with_one_message(tmp_path, capsys):
         (table1.command, ["--config=configs/pallet.py"], "--task=tower, but the config is of 'pallet': give --task=pallet"),
         (main_table.command, ["--config=configs/pallet.py"], "--task=tower, but the config is of 'pallet': give --task=pallet"),
         (main_table.command, ["--demos=many"], "--demos must be whole numbers"),
+        (table1.command, ["--config.train.steps=9"], "--config.train.steps=9 would have no effect: the field is set by --scale=cpu"),
+        (table1.command, ["--config.seed=1"], "--config.seed=1 would have no effect: the field is set by --seed"),
+        (ablation.command, ["--config.train.steps=9"], "--config.train.steps=9 would have no effect: the field is set by --steps"),
+        (main_table.command, ["--config.data.demos=9"], "--config.data.demos=9 would have no effect: the field is set by --demos"),
         (table1.command, ["--scale=big"], "--scale must be one of 'smoke', 'cpu', 'paper', got 'big'"),
     ]:
         with pytest.raises(SystemExit, match="2"):
