@@ -56,7 +56,7 @@ FLAGS = {
 }
 ITSELF = "the experiment, alike for all rows"
 FIELDS = {"train.steps": "--steps", "data.demos": "--demos", "seed": "--seed", "eval.start": "--start", "eval.episodes": "--episodes"}
-FIELDS |= dict.fromkeys(("eval.split", "train.eval_every", "train.eval_episodes"), ITSELF)
+FIELDS |= dict.fromkeys(("eval.split", *common.CHOOSES), ITSELF)
 
 
 def main(

@@ -45,7 +45,8 @@ def main(config, workdir, *, task: str, stages: str, growth: bool, repeats: int,
     known = [name for name in every if name not in ceilings]
     wanted = [options.check_choice("--stages", name, known) for name in stages.split(",") if name] or known
     before = read(against) if against else None
-    kind = "".join(letter if letter.isalnum() else "-" for letter in jax.devices()[0].device_kind.lower())
+    here = machine()
+    kind = "".join(letter if letter.isalnum() else "-" for letter in here["device"].lower())
     path = pathlib.Path(out) / f"{kind}-{task}.json"
     if path.exists() and (lost := {row["name"] for row in read(str(path), "--out")["stages"]} - {*ceilings, *wanted}):
         raise options.OptionsError(f"{path} holds stages that --stages={stages} leaves out: {', '.join(sorted(lost))}; give another --out")
@@ -60,7 +61,7 @@ def main(config, workdir, *, task: str, stages: str, growth: bool, repeats: int,
         row["share"] = {field: row[f"{field}_per_second"] / peak for field, peak in peaks.items() if f"{field}_per_second" in row}
     grown = [benchmark_stages.grow(name, config, repeats, apart=apart) for name in benchmark_stages.GROWTH] if growth else []
     targets = [benchmark_targets.judged(target, rows, task, jax.default_backend()) for target in benchmark_targets.TARGETS]
-    result = {"task": task, **machine(), "stages": rows, "growth": grown, "targets": targets}
+    result = {"task": task, **here, "stages": rows, "growth": grown, "targets": targets}
     writers.write_json(path, result)
     parts = [table(rows), *([growth_table(grown)] if grown else []), benchmark_targets.table(targets), str(path)]
     print("".join(f"\n{part}\n" for part in parts))

@@ -25,7 +25,7 @@ from lala_jax import build, cluster, loop, options, recording, rollout, scoring,
 from lala_jax.sim import tasks
 
 USER_ERRORS = (*build.USER_ERRORS, loop.NonFiniteError)
-CHOOSES = ("eval_every", "eval_episodes")  # fields of `train` by which the checkpoint that is scored is chosen
+CHOOSES = ("train.eval_every", "train.eval_episodes")  # fields by which the checkpoint that is scored is chosen
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,7 +108,11 @@ def is_same(stored: Mapping[str, Any], wanted: Mapping[str, Any]) -> bool:
 
 def _alike(there: Mapping[str, Any], here: Mapping[str, Any]) -> bool:
     """Say whether two configs, one of which may be older than some fields, give the same result."""
-    first, second = (build.run_settings(one) | {name: one["train"].get(name) for name in CHOOSES} for one in (there, here))
+
+    def settings(config):
+        return build.run_settings(config) | {name: value for name, value in options.fields(config).items() if name in CHOOSES}
+
+    first, second = settings(there), settings(here)
     return all(first[name] == second[name] for name in first.keys() & second.keys())
 
 

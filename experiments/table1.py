@@ -97,7 +97,7 @@ ROWS = (
     Entry("oracle", "oracle", family="computed", agent="oracle"),
 )
 LINES = ("blind", "top_view")  # drawn through the bars
-LAST = ("train.eval_every", "train.eval_episodes", "eval.strips")  # fields that say how a run ends
+LAST = (*common.CHOOSES, "eval.strips")  # fields that say how a run ends
 # What every row shares, and what the rows of a family do. A row of a family that lacks a scale would be another's double there.
 SCALES = {
     "smoke": (
