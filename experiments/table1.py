@@ -191,10 +191,11 @@ PUBLISHED = ("tower", "pallet")  # the order in Entry.published
 
 
 def owned(flags: Mapping[str, Any]) -> dict[str, str]:
-    """Give the fields that the scale, its rows and the flags set, and by what."""
+    """Give the fields that the scale, its rows and the flags set, and by what; not those whose new value is made of the given one."""
     scale = options.check_choice("--scale", flags["scale"], SCALES)
     texts = [*SCALES[scale], *(text for row in plan(scale) for text in row.overrides)]
-    ours = dict.fromkeys([*(text.partition("=")[0] for text in texts), *LAST], f"--scale={scale} and its rows")
+    names = [text.partition("=")[0] for text in texts if "{config." not in text]
+    ours = dict.fromkeys([*names, *LAST], f"--scale={scale} and its rows")
     return ours | {"eval.split": "--split", "eval.start": "--start", "seed": "--seed"}
 
 
