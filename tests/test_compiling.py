@@ -142,7 +142,7 @@ def test_what_no_result_needs_is_not_counted():
         return compiling.flops(jax.jit(function).trace(kernel).jaxpr)
 
     def convolve(kernel):
-        return convolution.narrowing(x, kernel, (1, 1), ((1, 1), (1, 1)), dimension_numbers=("NHWC", "HWIO", "NHWC"))
+        return convolution.product_gradient(x, kernel, (1, 1), ((1, 1), (1, 1)), dimension_numbers=("NHWC", "HWIO", "NHWC"))
 
     product = 2 * 64 * 9 * 40 * 4  # all cells with all entries
     assert count(jax.grad(lambda kernel: convolve(kernel).sum())) == product

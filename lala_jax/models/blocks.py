@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -37,8 +38,8 @@ class ResidualBlock(nn.Module):
         return nn.relu(y + shortcut) if self.last_relu else y + shortcut
 
     def _conv(self, features: int, size: int, name: str, stride: int = 1) -> nn.Conv:
-        kernel, strides = (size, size), (stride, stride)
-        return nn.Conv(features, kernel, strides, padding=size // 2, use_bias=False, dtype=self.dtype, name=name)
+        how = {"use_bias": False, "dtype": self.dtype, "name": name} | _gradient(size == 1)
+        return nn.Conv(features, (size, size), (stride, stride), padding=size // 2, **how)
 
 
 class ResNet43_8s(nn.Module):
@@ -68,10 +69,8 @@ class ResNet43_8s(nn.Module):
         the width.
         """
         check_sides(x.shape, self.stages)
-        # Faster than XLA's gradient on a CPU where there are many channels, as with features of pictures.
-        wide = x.shape[-1] > 9 * self.width and jax.default_backend() == "cpu"
-        how = {"conv_general_dilated": convolution.narrowing} if wide else {}
-        x = nn.relu(nn.Conv(self.width, (3, 3), padding=1, dtype=self.dtype, name="stem", **how)(x))
+        many = x.shape[-1] > 4 * self.width  # as with features of pictures
+        x = nn.relu(nn.Conv(self.width, (3, 3), padding=1, dtype=self.dtype, name="stem", **_gradient(many))(x))
         for stage in range(self.stages):
             x = residual_pair(x, self.width << stage, f"down{stage}", stride=2 if stage else 1, dtype=self.dtype)
         decoded = []
@@ -83,6 +82,11 @@ class ResNet43_8s(nn.Module):
             decoded.append(x)
         x = residual_pair(x, max(self.width // 4, MIN_HEAD), "head", self.out, last_relu=False, dtype=self.head_dtype or self.dtype)
         return x, decoded
+
+
+def _gradient(product: bool) -> dict[str, Any]:
+    """Give the argument of a convolution whose kernel's gradient is a `product`: faster on a CPU than XLA's."""
+    return {"conv_general_dilated": convolution.product_gradient} if product and jax.default_backend() == "cpu" else {}
 
 
 def residual_pair(

@@ -41,32 +41,36 @@ def blocked(lhs: jax.Array, rhs: jax.Array, window_strides: Sequence[int], paddi
     return jax.lax.conv_general_dilated(cells, kernel, (1, 1), pads, **kwargs)
 
 
-def narrowing(
+def product_gradient(
     lhs: jax.Array, rhs: jax.Array, window_strides: Sequence[int], padding: Sequence[tuple[int, int]], **kwargs: Any
 ) -> jax.Array:
-    """Take a convolution of many channels into few with its kernel's gradient as one matrix product.
+    """Take a convolution with its kernel's gradient as one matrix product: one of many channels into few, or of 1x1.
 
     Maps `lhs` `[B, H, W, C]` and `rhs` `[kh, kw, C, O]` to `[B, H', W', O]`. XLA's gradient is a convolution over `lhs` with channels in
     the place of the batch, and a CPU brings `lhs` into that order first, entry by entry, with whatever made it. The product reads it as it
-    lies, and for each entry of the kernel the slope: `kh kw O` values a cell, so `C` should be larger than that.
+    lies, and for each entry of the kernel the slope: `kh kw O` values a cell, so `C` should not be much smaller than that.
 
-    Raises ValueError for strides, dilation or groups. There is no derivative in forward mode.
+    Raises ValueError for dilation or groups, and for strides unless the kernel is 1x1 and nothing is padded. There is no derivative in
+    forward mode.
     """
     kwargs, odd = _plain(kwargs)
-    if any(step != 1 for step in window_strides) or odd:
-        raise ValueError(f"needs strides of 1 without dilation or groups, got {odd or tuple(window_strides)}")
+    (down, right, *_), strides = rhs.shape, tuple(window_strides)
+    if odd or (strides != (1, 1) and (down, right, *padding) != (1, 1, (0, 0), (0, 0))):
+        raise ValueError(f"needs strides of 1, or a 1x1 kernel without padding, and no dilation or groups, got {odd or strides}")
 
     def plain(lhs: jax.Array, rhs: jax.Array) -> jax.Array:
-        return jax.lax.conv_general_dilated(lhs, rhs, (1, 1), padding, **kwargs)
+        return jax.lax.conv_general_dilated(lhs, rhs, strides, padding, **kwargs)
 
     def backward(kept: tuple[jax.Array, jax.Array], slope: jax.Array) -> tuple[jax.Array, jax.Array]:
         lhs, rhs = kept
-        (down, right, *_), (_, rows, cols, _) = rhs.shape, lhs.shape
+        read = lhs[:, :: strides[0], :: strides[1]]
+        _, rows, cols, _ = read.shape
         room = [(size - 1 - low, size - 1 - high, 0) for size, (low, high) in zip((down, right), padding, strict=True)]
         wide = jax.lax.pad(slope, jnp.zeros((), slope.dtype), [(0, 0, 0), *room, (0, 0, 0)])
         moved = [wide[:, i : i + rows, j : j + cols] for i in reversed(range(down)) for j in reversed(range(right))]
-        product = jnp.einsum("bhwc,bhwno->nco", lhs, jnp.stack(moved, -2), precision=kwargs.get("precision"))
-        return jax.vjp(lambda lhs: plain(lhs, rhs), lhs)[1](slope)[0], product.reshape(rhs.shape)
+        product = jnp.einsum("bhwc,bhwo->co", read, jnp.concatenate(moved, -1), precision=kwargs.get("precision"))
+        kernel = product.reshape(rhs.shape[2], down, right, -1).transpose(1, 2, 0, 3)
+        return jax.vjp(lambda lhs: plain(lhs, rhs), lhs)[1](slope)[0], kernel
 
     convolve = jax.custom_vjp(plain)
     convolve.defvjp(lambda lhs, rhs: (plain(lhs, rhs), (lhs, rhs)), backward)

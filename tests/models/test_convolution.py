@@ -50,16 +50,26 @@ def test_nothing_is_dilated_backward():
     assert "lhs_dilate = [2, 2]" in reference.lower(jnp.zeros((1, 8, 8, 3))).as_text()
 
 
-@pytest.mark.parametrize("size, padding", [((3, 3), ((1, 1), (1, 1))), ((2, 3), ((0, 3), (4, 0))), ((1, 1), ((0, 0), (0, 0)))])
-def test_the_kernels_gradient_as_a_product_is_that_of_the_convolution(size, padding):
-    """Of a batch of images, and of batches that `vmap` makes."""
+@pytest.mark.parametrize(
+    "size, strides, padding",
+    [
+        ((3, 3), (1, 1), ((1, 1), (1, 1))),
+        ((2, 3), (1, 1), ((0, 3), (4, 0))),
+        ((1, 1), (1, 1), ((0, 0), (0, 0))),
+        ((1, 1), (1, 1), ((2, 0), (0, 1))),
+        ((1, 1), (2, 2), ((0, 0), (0, 0))),
+        ((1, 1), (4, 3), ((0, 0), (0, 0))),
+    ],
+)
+def test_the_kernels_gradient_as_a_product_is_that_of_the_convolution(size, strides, padding):
+    """Of a batch of images, and of batches that `vmap` makes; strides need not divide the sides."""
     rng = np.random.default_rng(0)
     x, kernel = (jnp.asarray(rng.normal(size=shape), jnp.float32) for shape in ((2, 3, 6, 8, 5), (*size, 5, 4)))
 
     def loss(x, kernel, convolve):
-        return jnp.sin(jax.vmap(lambda x: convolve(x, kernel, (1, 1), padding, dimension_numbers=NUMBERS))(x)).sum()
+        return jnp.sin(jax.vmap(lambda x: convolve(x, kernel, strides, padding, dimension_numbers=NUMBERS))(x)).sum()
 
-    both = convolution.narrowing, jax.lax.conv_general_dilated
+    both = convolution.product_gradient, jax.lax.conv_general_dilated
     (got, slopes), (want, expected) = (jax.value_and_grad(loss, (0, 1))(x, kernel, one) for one in both)
     np.testing.assert_allclose(got, want, rtol=1e-5)
     jax.tree.map(lambda mine, theirs: np.testing.assert_allclose(mine, theirs, atol=1e-4), slopes, expected)
@@ -73,7 +83,7 @@ def test_the_input_is_not_turned_for_it():
         return jax.jit(grad).lower(kernel).as_text()
 
     turned = "dim_numbers = [f, 0, 1, b]x"
-    assert turned in text(jax.lax.conv_general_dilated) and turned not in text(convolution.narrowing)
+    assert turned in text(jax.lax.conv_general_dilated) and turned not in text(convolution.product_gradient)
 
 
 @pytest.mark.parametrize(
@@ -91,8 +101,16 @@ def test_what_it_cannot_do_is_refused(change, message):
         convolution.blocked(jnp.zeros((1, 8, 8, 3)), jnp.zeros((3, 3, 3, 4)), **how)
 
 
-@pytest.mark.parametrize("change, message", [({"window_strides": (2, 1)}, "strides of 1"), ({"feature_group_count": 3}, "got 3 groups")])
-def test_what_has_no_gradient_of_its_own_is_refused(change, message):
-    how = {"window_strides": (1, 1), "padding": ((1, 1), (1, 1))} | change
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"window_strides": (2, 1)}, r"strides of 1, or a 1x1 kernel without padding.*got \(2, 1\)"),
+        ({"feature_group_count": 3}, "got 3 groups"),
+        ({"rhs_dilation": (2, 2)}, "got rhs_dilation"),
+    ],
+)
+@pytest.mark.parametrize("size, padding", [((3, 3), ((0, 0), (0, 0))), ((1, 1), ((1, 1), (1, 1)))])
+def test_what_has_no_gradient_of_its_own_is_refused(change, message, size, padding):
+    how = {"window_strides": (1, 1), "padding": padding} | change
     with pytest.raises(ValueError, match=message):
-        convolution.narrowing(jnp.zeros((1, 8, 8, 3)), jnp.zeros((3, 3, 3, 4)), **how)
+        convolution.product_gradient(jnp.zeros((1, 8, 8, 3)), jnp.zeros((*size, 3, 4)), **how)
