@@ -259,7 +259,7 @@ def model_card(card: Mapping[str, Any]) -> str:
         f"seeds: {data['seeds']}. Training seed {training['seed']}. The checkpoint was chosen by {training['selection']}.",
         "```bash\n" + card["commands"]["train"] + "\n```",
         "## Scores",
-        "Share of objects at their goal when the episode ends, 0 to 100, with the normal 95% interval over episodes.",
+        "Share of objects at their goal when the episode ends, 0 to 100, with the 95% interval over episodes.",
         "\n".join(["| split | seeds | episodes | score | complete | file |", "|---|---|---|---|---|---|", *scores]),
         *_other_worlds(card["robustness"]),
         "## Limits",

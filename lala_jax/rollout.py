@@ -147,14 +147,27 @@ def half_width(values: Sequence[float] | np.ndarray) -> float:
     return 1.96 * float(np.std(values, ddof=1)) / math.sqrt(len(values)) if len(values) > 1 else math.nan
 
 
+def interval(scores: Sequence[float] | np.ndarray) -> list[float]:
+    """Give the 95% interval of the mean of scores between 0 and 100: the normal one, NaNs for fewer than two.
+
+    Where all `n` scores are the same `c`, whose normal interval has no width, those means are left out under which that has a chance of
+    less than 2.5%. Scores of mean `m` are `c` with a probability of at most `m / c`, and `(100 - m) / (100 - c)` (Markov's inequality), so
+    the ends are `c a` and `100 - (100 - c) a`, with `a = 0.025 ** (1 / n)`: Clopper and Pearson's (1934) for `c` of 0 or 100.
+    """
+    mean, half = float(np.mean(scores)), half_width(scores)
+    if len(scores) > 1 and np.ptp(scores) == 0.0:
+        share = 0.025 ** (1 / len(scores))
+        return [mean * share, 100.0 - (100.0 - mean) * share]
+    return [max(mean - half, 0.0), min(mean + half, 100.0)]
+
+
 def head(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Sum up the lines of episodes (a summary's `per_episode`): mean score with a 95% interval, complete rate, number of actions."""
     scores = np.array([line["score"] for line in lines])
-    mean, half = float(scores.mean()), half_width(scores)
     return {
         "episodes": len(lines),
-        "score": mean,
-        "interval95": [max(mean - half, 0.0), min(mean + half, 100.0)],
+        "score": float(scores.mean()),
+        "interval95": interval(scores),
         "complete_percent": 100.0 * float(np.mean([line["complete"] for line in lines])),
         "actions": sum(line["actions"] for line in lines),
     }

@@ -7,6 +7,7 @@ import time
 import jax
 import numpy as np
 import pytest
+from scipy import stats
 
 from lala_jax import build, dataset, defaults, options, recording, rollout, types
 from lala_jax.sim import oracle, physics, tasks
@@ -158,6 +159,26 @@ def test_interval_is_the_normal_one():
     summed = rollout.summary(episodes)
     half = 1.96 * np.std([100, 0, 0], ddof=1) / np.sqrt(3)
     np.testing.assert_allclose(summed["interval95"], [0.0, min(100, 100 / 3 + half)])
+
+
+@pytest.mark.parametrize(("same", "successes"), [(0.0, 0), (100.0, 9)])
+def test_interval_of_nothing_but_zeros_or_hundreds_is_clopper_and_pearsons(same, successes):
+    exact = stats.binomtest(successes, 9).proportion_ci(method="exact")
+    np.testing.assert_allclose(rollout.interval([same] * 9), [100 * exact.low, 100 * exact.high])
+
+
+def test_interval_of_equal_scores_has_the_means_under_which_they_are_not_too_unlikely():
+    same, count = 100 / 3, 7  # a third has no exact float
+    others = np.concatenate([np.linspace(0, same - 1, 50), np.linspace(same + 1, 100, 50)])
+
+    def chance(mean):
+        """The greatest over distributions on `same` and one other score, all with this mean."""
+        share = (mean - others) / (same - others)
+        return np.max(share[(share >= 0) & (share <= 1)]) ** count
+
+    low, high = rollout.interval([same] * count)
+    assert chance(low - 0.01) < 0.025 < chance(low + 0.01)
+    assert chance(high + 0.01) < 0.025 < chance(high - 0.01)
 
 
 def told(scene, *actions):
