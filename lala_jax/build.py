@@ -21,6 +21,9 @@ from lala_jax import (
     parallel,
     policy,
     policy_cliport,
+    policy_goal_aware,
+    policy_graph,
+    policy_transporter,
     pretrain_step,
     train_step,
     types,
@@ -146,9 +149,9 @@ def build_policy(config: Mapping[str, Any]) -> policy.Policy:
             trunk_blocks=fields["trunk_blocks"], fine_width=fields["width"], matching=fields["matching"], **shared,
         )  # fmt: skip
         choices = {name: fields[name] for name in ("multi_action", "match_weight", "refine", "max_height", "average_turns")}
-        return policy.GoalAwarePolicy(model=model, **choices)
+        return policy_goal_aware.GoalAwarePolicy(model=model, **choices)
     if fields["name"] == "graph":
-        return policy.GraphPolicy(model=graph.Graph(width=fields["width"]), spec=spec, multi_action=fields["multi_action"])
+        return policy_graph.GraphPolicy(model=graph.Graph(width=fields["width"]), spec=spec, multi_action=fields["multi_action"])
     shared |= {"yaw_bins": fields["rotations"], "width": fields["width"], "stages": fields["stages"], "dtype": jnp.dtype(dtype)}
     choices = {name: fields[name] for name in ("multi_action", "max_height")}
     try:
@@ -157,7 +160,7 @@ def build_policy(config: Mapping[str, Any]) -> policy.Policy:
             told = encoders.load(built.name, built.num_objects, **files)
             return policy_cliport.CliportPolicy(model=cliport.Cliport(**shared, text_layer=not files), spec=spec, **told, **choices)
         net = transporter.Transporter(variant=fields["name"], **shared)
-        return policy.TransporterPolicy(model=net, spec=spec, surface=surface(config), **choices)
+        return policy_transporter.TransporterPolicy(model=net, spec=spec, surface=surface(config), **choices)
     except ValueError as error:
         raise options.OptionsError(str(error)) from error
 

@@ -17,14 +17,15 @@ CONFIGS = sorted(path for path in (ROOT / "configs").glob("*.py") if not path.na
 OPTIONS = ("", "smoke", "paper")
 
 ENTRY_POINTS = {"train", "pretrain", "collect", "evaluate", "publish", "report"}
-PURE = {"types", "perception", "models", "losses", "metrics", "augment", "policy", "policy_cliport"}
+POLICIES = {"policy", "policy_cliport", "policy_goal_aware", "policy_graph", "policy_transporter"}
+PURE = {"types", "perception", "models", "losses", "metrics", "augment", *POLICIES}
 # Below each part, the parts of the package it may import; what is not listed may import all but entry points.
 BELOW = {
     "": set(),
     "types": set(),
     "perception": {"types"},
     "models": {"types", "perception"},
-    **dict.fromkeys(("losses", "metrics", "augment", "policy", "policy_cliport"), PURE),
+    **dict.fromkeys(("losses", "metrics", "augment", *POLICIES), PURE),
     **dict.fromkeys(("optim", "state"), PURE | {"optim", "state"}),
     "sim": {"types", "perception"},
     "options": set(),
