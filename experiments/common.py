@@ -21,7 +21,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from lala_jax import build, cluster, loop, options, recording, rollout, scoring, train, writers
+from lala_jax import build, cluster, loop, options, pretrained, recording, rollout, scoring, train, writers
 from lala_jax.sim import tasks
 
 USER_ERRORS = (*build.USER_ERRORS, loop.NonFiniteError)
@@ -226,7 +226,7 @@ def train_and_score(config, directory: pathlib.Path) -> dict[str, Any]:
 def load_weights(path: str, config) -> tuple[Any, dict[str, Any]]:
     """Load the averaged parameters of a checkpoint, and say what identifies them."""
     params = scoring.check_checkpoint(path, config, build.build_policy(config))
-    return params, scoring.fingerprint(path, params)
+    return params, pretrained.fingerprint(path, params)
 
 
 def score(config, params, seeds: Sequence[int]) -> dict[str, Any]:

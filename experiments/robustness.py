@@ -62,7 +62,8 @@ def main(
         for row in done[1:] if done[0]["name"] == chosen[0].name else ():
             row["drop"] = common.difference(done[0]["scores"], row["scores"], paired=paired[row["name"]])
         conditions = {row["label"]: {field: row[field] for field in publish.SCORE} for row in kept}
-        return {"task": name, "split": split, "checkpoint": checkpoint, "reference": chosen[0].name, "conditions": conditions}
+        facts = {"task": name, "split": split, "checkpoint": checkpoint, "weights": weights}
+        return {**facts, "reference": chosen[0].name, "conditions": conditions}
 
     path = pathlib.Path(out or f"experiments/results/{name}") / f"robustness-{split}.json"
     loaded = params if launch is None else None

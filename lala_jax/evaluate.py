@@ -28,8 +28,8 @@ def main(
     seeds = build.split_seeds(split, start if start >= 0 else config.eval.start, episodes or config.eval.episodes)
     out = pathlib.Path(build.workdir(config, workdir))
     parts = out / f"scores-{agent}-{split}.parts"
-    result, strips = score(config, checkpoint, agent, seeds, launch, parts)
-    scoring.write_scores(config, result, strips, out, agent=agent, split=split, seeds=seeds, source=checkpoint or None)
+    result, strips, weights = score(config, checkpoint, agent, seeds, launch, parts)
+    scoring.write_scores(config, result, strips, out, agent=agent, split=split, seeds=seeds, source=checkpoint or None, weights=weights)
     if launch is not None:
         shutil.rmtree(parts)
     if agent == "policy" and not reproduced(checkpoint, config, split=split, seeds=seeds, result=result):
@@ -38,22 +38,23 @@ def main(
 
 
 def score(config, checkpoint: str, agent: str, seeds: Sequence[int], launch: cluster.Launcher | None, parts: pathlib.Path):
-    """Score here or by workers, which leave parts: the summary and the pictures."""
+    """Score here or by workers, which leave parts: the summary, the pictures and what identifies the weights."""
     weights = None
     if agent == "policy":
         if not checkpoint:
             raise options.OptionsError(NO_CHECKPOINT)
         built, observer = build.build_policy(config), build.observer(config)
         params = scoring.check_checkpoint(checkpoint, config, built)
+        weights = pretrained.fingerprint(checkpoint, params)
         if launch is None:
-            return scoring.evaluate(
+            result, strips = scoring.evaluate(
                 built, params, observer, seeds=seeds, parallel=config.eval.parallel, threads=config.data.threads,
                 strips=config.eval.strips, seed=config.seed, progress=lambda done, total: print(f"{done} of {total} episodes", flush=True),
             )  # fmt: skip
-        weights = scoring.fingerprint(checkpoint, params)
+            return result, strips, weights
     if launch is None:
-        return scoring.baseline(agent, build.task(config), seeds=seeds, threads=config.data.threads), {}
-    return scoring.evaluate_in_parts(launch, config, parts, agent=agent, path=checkpoint, weights=weights, seeds=seeds)
+        return scoring.baseline(agent, build.task(config), seeds=seeds, threads=config.data.threads), {}, None
+    return *scoring.evaluate_in_parts(launch, config, parts, agent=agent, path=checkpoint, weights=weights, seeds=seeds), weights
 
 
 def reproduced(path: str, config, *, split: str, seeds: Sequence[int], result: Mapping[str, Any]) -> bool:

@@ -16,6 +16,7 @@ import math
 import os
 import pathlib
 import zipfile
+import zlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -75,6 +76,12 @@ def describe(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Give at least `step`, `config` and `input_spec` of what `load` reads, parameters unread."""
     found = card(path)
     return checkpoint.describe(find(path)) if found is None else found
+
+
+def fingerprint(path: str | os.PathLike[str], params: Any) -> dict[str, Any]:
+    """Say what identifies the weights of a checkpoint: the step, and a checksum of all leaves."""
+    content = b"".join(np.asarray(leaf).tobytes() for _, leaf in sorted(checkpoint.named(params).items()))
+    return {"step": describe(path)["step"], "crc32": zlib.crc32(content)}
 
 
 def card(path: str | os.PathLike[str]) -> dict[str, Any] | None:

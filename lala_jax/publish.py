@@ -104,8 +104,8 @@ def _score_rows(files: Sequence[str], source: str, config: Mapping[str, Any]) ->
     for file in files:
         found = _read_json(file)
         try:
-            if found["agent"] != "policy" or not _same_weights(found["checkpoint"], source):
-                raise options.OptionsError(f"{file} holds scores of {found['checkpoint'] or found['agent']}, not of {source}")
+            if found["agent"] != "policy" or not _same_weights(found, source):
+                raise options.OptionsError(f"{file} holds scores of {_scored(found)}, not of {source}")
             changed = pretrained.differences(found["config"], config)
             if changed:
                 raise options.OptionsError(f"{file} holds scores of another {', '.join(changed)}, here: {source}")
@@ -117,8 +117,20 @@ def _score_rows(files: Sequence[str], source: str, config: Mapping[str, Any]) ->
     return rows, settings[0]
 
 
-def _same_weights(one: str | None, other: str) -> bool:
-    """Say whether two names stand for the same parameters: the same place, or equal in every leaf."""
+def _scored(found: Mapping[str, Any]) -> str:
+    """Name what a file of scores is of: the checkpoint, and what it held then; an agent without one."""
+    held = f", when it held {found['weights']}" if found.get("weights") else ""
+    return f"{found['checkpoint']}{held}" if found["checkpoint"] is not None else found["agent"]
+
+
+def _same_weights(found: Mapping[str, Any], source: str) -> bool:
+    """Say whether a file of scores is of the parameters at `source`.
+
+    By the fingerprint it holds; an older file by the checkpoint it names: the same place, or equal in every leaf.
+    """
+    if found.get("weights") is not None:
+        return found["weights"] == pretrained.fingerprint(source, pretrained.load(source)[0])
+    one, other = found["checkpoint"], source
     if one is None:
         return False
     if os.path.abspath(pretrained.find(one)) == os.path.abspath(pretrained.find(other)):
@@ -179,8 +191,8 @@ def _robustness(file: str, task: str, source: str) -> dict[str, Any]:
     """Read the scores in other worlds that `experiments.robustness` writes."""
     found = _read_json(file)
     try:
-        if found["task"] != task or not _same_weights(found["checkpoint"], source):
-            raise options.OptionsError(f"{file} holds scores of {found['task']}, {found['checkpoint']}, not of {task}, {source}")
+        if found["task"] != task or not _same_weights(found, source):
+            raise options.OptionsError(f"{file} holds scores of {found['task']}, {_scored(found)}, not of {task}, {source}")
         rows = [{"condition": name, **_row(row, (), file)} for name, row in found["conditions"].items()]
         return {"file": file, "split": found["split"], "conditions": rows}
     except (KeyError, TypeError, AttributeError) as error:

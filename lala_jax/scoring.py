@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import pathlib
-import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -134,12 +133,6 @@ def baseline(name: str, observer_task, *, seeds: Sequence[int], threads: int) ->
     return rollout.summary(rollout.run(observer_task, scenes, seeds, agent, threads=threads))
 
 
-def fingerprint(path: str, params: Any) -> dict[str, Any]:
-    """Say what identifies the weights of a checkpoint: the step, and a checksum of all leaves."""
-    content = b"".join(np.asarray(leaf).tobytes() for _, leaf in sorted(checkpoint.named(params).items()))
-    return {"step": pretrained.describe(path)["step"], "crc32": zlib.crc32(content)}
-
-
 def score_span(
     config, places: range, pictures_file: pathlib.Path, *, agent: str, path: str, weights: Mapping[str, Any] | None, seeds: Sequence[int]
 ) -> dict[str, Any]:
@@ -151,7 +144,7 @@ def score_span(
         return baseline(agent, build.task(config), seeds=[seeds[place] for place in places], threads=config.data.threads)
     built, observer = build.build_policy(config), build.observer(config)
     params = check_checkpoint(path, config, built)
-    if (now := fingerprint(path, params)) != weights:
+    if (now := pretrained.fingerprint(path, params)) != weights:
         raise checkpoint.CheckpointError(f"{path} changed meanwhile: it holds {now}, the others scored {weights}")
     result, drawn = evaluate(
         built, params, observer, seeds=seeds, parallel=config.eval.parallel, threads=config.data.threads, strips=config.eval.strips,
@@ -245,15 +238,22 @@ def _check_shapes(path, params, template) -> None:
             raise checkpoint.MismatchError(f"{path} is of another model: {name} is {shapes}")
 
 
-def write_scores(config, result, strips, out: pathlib.Path, *, agent: str, split: str, seeds: Sequence[int], source: str | None) -> None:
-    """Write `scores-<agent>-<split>.json` and the pictures to `out`, and print the line that matters."""
+def write_scores(
+    config, result, strips, out: pathlib.Path, *, agent: str, split: str, seeds: Sequence[int], source: str | None,
+    weights: Mapping[str, Any] | None,
+) -> None:  # fmt: skip
+    """Write `scores-<agent>-<split>.json` and the pictures to `out`, and print the line that matters.
+
+    `source` and `weights` say of which checkpoint: where it is, and its `pretrained.fingerprint`.
+    """
     if agent == "policy":  # the only one that is drawn
         for left in (*out.glob(f"episode-{split}-*.webp"), *out.glob(f"failure-{split}-*.webp")):
             left.unlink()  # they do not belong to these scores
     for (kind, number), picture in strips.items():
         writers.write_image(out / f"{kind}-{split}-{number}.webp", picture)
     path = out / f"scores-{agent}-{split}.json"
-    facts = {"agent": agent, "task": config.task.name, "split": split, "seeds": [seeds[0], seeds[-1]], "checkpoint": source}
+    facts = {"agent": agent, "task": config.task.name, "split": split, "seeds": [seeds[0], seeds[-1]]}
+    facts |= {"checkpoint": source, "weights": weights}
     writers.write_json(path, {**facts, **result, "device": jax.devices()[0].device_kind, "config": options.to_dict(config)})
     low, high = result["interval95"]
     print(

@@ -13,7 +13,22 @@ from typing import Any
 
 import jax
 
-from lala_jax import build, checkpoint, compiling, dataset, loop, options, parallel, recording, scoring, state, train_step, types, writers
+from lala_jax import (
+    build,
+    checkpoint,
+    compiling,
+    dataset,
+    loop,
+    options,
+    parallel,
+    pretrained,
+    recording,
+    scoring,
+    state,
+    train_step,
+    types,
+    writers,
+)
 
 step = compiling.jit(train_step.train_step, static_argnums=0, donate_argnums=1)
 
@@ -106,7 +121,9 @@ def final_scores(config, recipe, params, out: pathlib.Path) -> dict[str, Any]:
         recipe.policy, params, recipe.observer, seeds=seeds, parallel=fields.parallel, threads=config.data.threads, strips=fields.strips,
         seed=config.seed,
     )  # fmt: skip
-    scoring.write_scores(config, result, strips, out, agent="policy", split=fields.split, seeds=seeds, source=str(out / "checkpoints"))
+    source = str(out / "checkpoints")
+    weights = pretrained.fingerprint(source, params)
+    scoring.write_scores(config, result, strips, out, agent="policy", split=fields.split, seeds=seeds, source=source, weights=weights)
     return result
 
 

@@ -20,7 +20,7 @@ from test_scoring import SINGLE, save
 from test_train_step import tiny_config
 
 from experiments import ablation, common, main_table, robustness, table1
-from lala_jax import build, cluster, dataset, options, pretrain, recording, rollout, scoring, train, writers
+from lala_jax import build, cluster, dataset, options, pretrain, pretrained, recording, rollout, scoring, train, writers
 
 TESTS = pathlib.Path(__file__).parent
 pytest.importorskip("submitit")
@@ -433,8 +433,8 @@ def test_evaluation_in_parts_is_that_of_one_process(call, tmp_path, monkeypatch)
 def test_a_checkpoint_that_changes_meanwhile_is_noticed(tmp_path):
     config = tiny_config(*SINGLE)
     params = save(tmp_path, config)
-    weights = scoring.fingerprint(str(tmp_path), params)
-    other = scoring.fingerprint(str(tmp_path), jax.tree.map(lambda leaf: leaf + np.float32(1), params))
+    weights = pretrained.fingerprint(str(tmp_path), params)
+    other = pretrained.fingerprint(str(tmp_path), jax.tree.map(lambda leaf: leaf + np.float32(1), params))
     assert weights != other and weights["step"] == 1
     with pytest.raises(scoring.checkpoint.CheckpointError, match="changed meanwhile"):
         scoring.score_span(config, range(1), tmp_path / "x.npz", agent="policy", path=str(tmp_path), weights=other, seeds=[1])

@@ -235,8 +235,9 @@ def test_scores_of_the_same_weights_elsewhere_are_taken(run, published, tmp_path
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"checkpoint": "runs/other/checkpoints"}, "holds scores of runs/other/checkpoints, not of"),
-        ({"agent": "oracle", "checkpoint": None}, "holds scores of oracle, not of"),
+        ({"checkpoint": "runs/other/checkpoints", "weights": ...}, "holds scores of runs/other/checkpoints, not of"),  # an older file
+        ({"weights": {"step": 7, "crc32": 1}}, r"holds scores of .*checkpoints, when it held {'step': 7, 'crc32': 1}, not of"),
+        ({"agent": "oracle", "checkpoint": None, "weights": None}, "holds scores of oracle, not of"),
         ({"config": {"model": {"width": 99}}}, r"holds scores of another model.width \(99 there, 4 here\)"),
         ({"config": {"task": {"name": "pallet"}}}, r"holds scores of another task.name \('pallet' there, 'tower' here\)"),
         ({"config": {"camera": {"preset": "paper"}}}, r"another camera.preset \('paper' there, 'ring' here\)"),

@@ -136,9 +136,11 @@ def test_scores_and_pictures_are_written(alone, tmp_path, capsys):
     config = tiny_config(*SINGLE)
     for left in ("failure-val-7.webp", "failure-test-0.webp"):
         (tmp_path / left).write_bytes(b"of earlier scores")
-    scoring.write_scores(config, summary, drawn, tmp_path, agent="policy", split="val", seeds=SEEDS, source="there")
+    weights = {"step": 3, "crc32": 7}
+    scoring.write_scores(config, summary, drawn, tmp_path, agent="policy", split="val", seeds=SEEDS, source="there", weights=weights)
     stored = json.loads((tmp_path / "scores-policy-val.json").read_text())
-    assert stored["score"] == summary["score"] and stored["seeds"] == [1, 5] and stored["checkpoint"] == "there"
+    assert stored["score"] == summary["score"] and stored["seeds"] == [1, 5]
+    assert stored["checkpoint"] == "there" and stored["weights"] == weights
     assert options.to_dict(options.from_dict(stored["config"])) == options.to_dict(config)
     names = sorted(f"{kind}-val-{number}.webp" for kind, number in drawn)
     assert sorted(path.name for path in tmp_path.glob("*.webp")) == sorted(["failure-test-0.webp", *names])
