@@ -1,7 +1,8 @@
 """What the experiments share: rows as data, a JSON file of finished rows to go on from, differences with intervals, Markdown tables.
 
-Every file is `{"task", ..., "rows": [...]}`. A row has `name`, `label`, what identifies it (`overrides`, `seeds`, `checkpoint` or null,
-`config`), its scores (`score`, `interval95`, `complete_percent`, `first_failures`, ..., `scores` by seed) and `seconds`, how long it took.
+Every file is `{"task", ..., "rows": [...]}`. A row has `name`, `label`, what identifies it (`overrides`, `revision`, `seeds`,
+`checkpoint` or null, `config`, `beside`), its scores (`score`, `interval95`, `complete_percent`, `first_failures`, ..., `scores` by seed)
+and `seconds`, how long it took.
 Rows run one after the other in this process, or each in a worker of its own.
 """
 

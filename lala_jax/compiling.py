@@ -142,7 +142,7 @@ def _glibc(name: str, *arguments: int) -> None:
 
 
 def keep_programs() -> None:
-    """Keep compiled programs in the user's cache folder, for processes to come: their first training step is there in a fifth of the time.
+    """Keep compiled programs in the user's cache folder, for processes to come: their first training step is there in a third of the time.
 
     JAX_COMPILATION_CACHE_DIR names another folder, JAX_ENABLE_COMPILATION_CACHE=false keeps nothing. The folder may be deleted.
     """

@@ -1,4 +1,4 @@
-"""Recorded demonstrations on disk: a directory per (task, split) of checksummed shards.
+"""Recorded demonstrations on disk: a directory per task and options of it, of checksummed shards.
 
     <path>/meta.json           task, task options, format version
     <path>/shard-000000.demo   one `append` each, in order; never changed once written

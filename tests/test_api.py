@@ -18,14 +18,14 @@ OPTIONS = ("", "smoke", "paper")
 
 ENTRY_POINTS = {"train", "pretrain", "collect", "evaluate", "publish", "report"}
 POLICIES = {"policy", "policy_cliport", "policy_goal_aware", "policy_graph", "policy_transporter"}
-PURE = {"types", "perception", "models", "losses", "metrics", "augment", *POLICIES}
+PURE = {"types", "perception", "models", "losses", "augment", *POLICIES}
 # Below each part, the parts of the package it may import; what is not listed may import all but entry points.
 BELOW = {
     "": set(),
     "types": set(),
     "perception": {"types"},
     "models": {"types", "perception"},
-    **dict.fromkeys(("losses", "metrics", "augment", *POLICIES), PURE),
+    **dict.fromkeys(("losses", "augment", *POLICIES), PURE),
     **dict.fromkeys(("optim", "state"), PURE | {"optim", "state"}),
     "sim": {"types", "perception"},
     "options": set(),

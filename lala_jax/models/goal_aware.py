@@ -1,6 +1,6 @@
 """The default agent's network: match what is seen now with what the goal still lacks, then correlate where it fits.
 
-Three steps, each dense over the map (see the README's design notes for why):
+Three steps, each dense over the map (why: see the README, "The default agent"):
 
 1. Match. Every occupied voxel of either map gets an embedding, one small network for both maps and all heights, so that an
    object looks the same at every level. A trunk over both maps at once says which goal voxels may be built next (`b`). The pick
@@ -160,7 +160,7 @@ class GoalAware(nn.Module):
     spec: types.MapSpec
     rotations: int = 36
     crop: int = 24  # cells, must hold the largest object at any yaw
-    tokens: int = 704  # goal voxels matched: a finished pallet of eight boxes shows about 520 that differ, a tower of six 300
+    tokens: int = 704  # goal voxels matched: a finished pallet of eight boxes shows about 520 that differ, a tower of six 200
     embed: int = 16
     trunk_width: int = 48
     trunk_blocks: int = 3
@@ -342,7 +342,7 @@ def _window(values, rows, cols):
 
 
 def _turn_offsets(crops, yaw):
-    """Turn the offsets (row, col) of the points in a turned crop `[..., crop, crop, 8]` as well, by `yaw` `[...]` radians."""
+    """Turn the offsets (row, col) of the points in a turned crop `[..., crop, crop, 10]` as well, by `yaw` `[...]` radians."""
     row, col = crops[..., 3], crops[..., 4]
     cos, sin = jnp.cos(yaw), jnp.sin(yaw)
     return crops.at[..., 3].set(cos * row + sin * col).at[..., 4].set(cos * col - sin * row)
