@@ -25,6 +25,11 @@ class Lever(common.Row):
 
     trains: bool = True
 
+    def beside(self, config) -> dict[str, Any]:
+        """Give the revision of the first row, where its weights are taken, once there is one."""
+        del config
+        return {"first": ROWS[0].revision} if not self.trains and ROWS[0].revision else {}
+
 
 PERFECT = ("augment.depth_noise=0.0", "augment.shift=0.0", "augment.turn=0.0", "augment.missing=0.0")
 RECOVERIES = ("data.mistakes=0.15", "data.directory={config.data.directory}-mistakes")
@@ -95,7 +100,9 @@ def run(row: Lever, *, base, runs: pathlib.Path, seeds: Sequence[int]) -> dict[s
     config = row.configs(base)[0]
     if row.trains:
         return common.train_and_score(config, runs / row.folder)
-    params, weights = common.load_weights(str(runs / ROWS[0].folder / "checkpoints"), config)
+    first = str(runs / ROWS[0].folder / "checkpoints")
+    common.check_run(first, ROWS[0].configs(base)[0])
+    params, weights = common.load_weights(first, config)
     return {**common.row_of(common.score(config, params, seeds)), "train_seconds": 0.0, "weights": weights}
 
 

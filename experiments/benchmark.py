@@ -5,8 +5,8 @@ product and a copy of the same run say how much of the machine's own rate a stag
 Writes `<device>-<task>.json` to `--out` and prints its tables. `--stages=render,fuse` times only these (and the two ceilings); as ratios
 are of one run, it is refused where it would replace a file that holds other stages, too.
 `--against=FILE` compares with an earlier file by ratios of medians, and ends with status 1 where a stage takes more than `--limit`
-times as long. Comparisons that need what is not installed (PyTorch: extra `benchmark`; OpenGL: Debian's libegl1 and libgl1-mesa-dri)
-are left out, and the table says so.
+times as long or fails. Comparisons that need what is not installed (PyTorch: extra `benchmark`; OpenGL: Debian's libegl1 and
+libgl1-mesa-dri) are left out, and the table says so.
 """
 
 from __future__ import annotations
@@ -48,15 +48,20 @@ def main(config, workdir, *, task: str, stages: str, growth: bool, repeats: int,
     here = machine()
     kind = "".join(letter if letter.isalnum() else "-" for letter in here["device"].lower())
     path = pathlib.Path(out) / f"{kind}-{task}.json"
-    if path.exists() and (lost := {row["name"] for row in read(str(path), "--out")["stages"]} - {*ceilings, *wanted}):
-        raise options.OptionsError(f"{path} holds stages that --stages={stages} leaves out: {', '.join(sorted(lost))}; give another --out")
+    if path.exists():
+        held = read(str(path), "--out")
+        if lost := {row["name"] for row in held["stages"]} - {*ceilings, *wanted}:
+            left = ", ".join(sorted(lost))
+            raise options.OptionsError(f"{path} holds stages that --stages={stages} leaves out: {left}; give another --out")
+        if held.get("growth") and not growth:
+            raise options.OptionsError(f"{path} holds how cost grows, which this leaves out: give --growth=true or another --out")
     apart = jax.default_backend() == "cpu"  # a GPU's memory is this process's
     rows = []
     for name in (*ceilings, *wanted):
         print(f"{name}: {every[name].label}", flush=True)
         rows.append(timing.timed(name, every, config, repeats, apart=apart))
         print(f"  {cost(rows[-1])}", flush=True)
-    peaks = {field: next(row for row in rows if row["name"] == name)[f"{field}_per_second"] for name, field in ceilings.items()}
+    peaks = {field: row[f"{field}_per_second"] for row in rows if (field := ceilings.get(row["name"])) and f"{field}_per_second" in row}
     for row in rows:
         row["share"] = {field: row[f"{field}_per_second"] / peak for field, peak in peaks.items() if f"{field}_per_second" in row}
     grown = [benchmark_stages.grow(name, config, repeats, apart=apart) for name in benchmark_stages.GROWTH] if growth else []
@@ -128,17 +133,20 @@ def read(path: str, flag: str = "--against") -> dict[str, Any]:
 
 
 def slower(before: Mapping[str, Any], after: Mapping[str, Any], limit: float) -> list[str]:
-    """Print the ratio of each stage's medians, after to before, and name the stages above `limit`."""
+    """Print the ratio of each stage's medians, after to before, and name the stages above `limit` and those that no longer run."""
     if before["device"] != after["device"] or before["task"] != after["task"]:
         there, here = (f"{one['task']} on {one['device']}" for one in (before, after))
         raise options.OptionsError(f"--against holds {there}, this is {here}: their ratio says nothing")
     old = {row["name"]: row["seconds"] for row in before["stages"] if "seconds" in row}
+    lost = {row["name"]: row["unavailable"] for row in after["stages"] if row.get("failed") and row["name"] in old}
     ratios = {row["name"]: row["seconds"] / old[row["name"]] for row in after["stages"] if "seconds" in row and row["name"] in old}
     print(common.table(["stage", "time, ratio"], [[name, f"{ratio:.2f}"] for name, ratio in ratios.items()]))
     found = [name for name, ratio in ratios.items() if ratio > limit]
     if found:
         print(f"more than {limit} times as long: {', '.join(found)}")
-    return found
+    for name, why in lost.items():
+        print(f"{name} no longer runs: {why}")
+    return [*found, *lost]
 
 
 def command(argv: Sequence[str] | None = None):

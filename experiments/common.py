@@ -14,7 +14,6 @@ import itertools
 import json
 import math
 import pathlib
-import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
@@ -22,10 +21,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from lala_jax import build, cluster, loop, options, pretrained, recording, rollout, scoring, train, writers
+from lala_jax import build, checkpoint, cluster, loop, options, pretrained, recording, rollout, scoring, train, writers
 from lala_jax.sim import tasks
 
 USER_ERRORS = (*build.USER_ERRORS, loop.NonFiniteError)
+ERRS = ("camera.shift", "camera.turn", "camera.depth_noise")  # how cameras err is drawn for as many episodes as are observed at once
 CHOOSES = ("train.eval_every", "train.eval_episodes")  # fields by which the checkpoint that is scored is chosen
 
 
@@ -111,7 +111,9 @@ def _alike(there: Mapping[str, Any], here: Mapping[str, Any]) -> bool:
     """Say whether two configs, one of which may be older than some fields, give the same result."""
 
     def settings(config):
-        return build.run_settings(config) | {name: value for name, value in options.fields(config).items() if name in CHOOSES}
+        fields = options.fields(config)
+        more = CHOOSES if not any(fields[name] for name in ERRS if name in fields) else (*CHOOSES, "eval.parallel")
+        return build.run_settings(config) | {name: fields[name] for name in more if name in fields}
 
     first, second = settings(there), settings(here)
     return all(first[name] == second[name] for name in first.keys() & second.keys())
@@ -194,8 +196,8 @@ def _fanned(launch, path, rows, found, run, wanted, before) -> Iterator[tuple[Ro
     for name, result in cluster.run(launch, tasks, folder):
         if name in left:
             yield left[name], result
-            (folder / f"{name}.json").unlink()  # the file holds it now
-    shutil.rmtree(folder, ignore_errors=True)
+            (folder / f"{name}.json").unlink(missing_ok=True)  # the file holds it now; another command may have been first
+    cluster.sweep(folder)
 
 
 # Runs and scores
@@ -230,6 +232,13 @@ def load_weights(path: str, config) -> tuple[Any, dict[str, Any]]:
     return params, pretrained.fingerprint(path, params)
 
 
+def check_run(path: str, config) -> None:
+    """Raise CheckpointError where a checkpoint is not of the run that `config` makes."""
+    there, here = (build.run_settings(one) for one in (pretrained.describe(path)["config"], writers.plain(options.to_dict(config))))
+    if changed := options.differences(there, here):
+        raise checkpoint.CheckpointError(f"{path} is of a run with another {', '.join(changed)}")
+
+
 def score(config, params, seeds: Sequence[int]) -> dict[str, Any]:
     """Score weights in the world of the config: `rollout.summary`."""
 
@@ -256,11 +265,22 @@ def difference(scores: Mapping[str, float], reference: Mapping[str, float], *, p
     if paired:
         if scores.keys() != reference.keys():
             raise ValueError(f"paired scores need the same seeds, got {len(scores)} and {len(reference)} of them, or others")
-        half = rollout.half_width([value - reference[seed] for seed, value in scores.items()])
+        down, up = _reach([value - reference[seed] for seed, value in scores.items()], -100.0)
     else:
-        half = math.hypot(*(rollout.half_width(list(one.values())) for one in (scores, reference)))
+        (down, up), (other_down, other_up) = (_reach(list(one.values()), 0.0) for one in (scores, reference))
+        down, up = math.hypot(down, other_up), math.hypot(up, other_down)  # Newcombe (1998), method 10
     mean = float(np.mean(list(scores.values())) - np.mean(list(reference.values())))
-    return {"mean": mean, "interval95": [mean - half, mean + half], "paired": paired}
+    return {"mean": mean, "interval95": [mean - down, mean + up], "paired": paired}
+
+
+def _reach(values: Sequence[float], lowest: float) -> tuple[float, float]:
+    """Say how far the interval of the mean of values from `lowest` to 100 reaches down and up; as `rollout.interval`, without the cut."""
+    if len(values) > 1 and np.ptp(values) == 0.0:
+        scale = (100.0 - lowest) / 100.0
+        low, high = rollout.interval([(value - lowest) / scale for value in values])
+        at = (values[0] - lowest) / scale
+        return scale * (at - low), scale * (high - at)
+    return (half := rollout.half_width(values)), half
 
 
 # Tables

@@ -183,8 +183,15 @@ def main(
     work, path = functools.partial(work_on, base=base, runs=runs, seeds=seeds, task=task), out_path / f"{scale}-{task}.json"
     before = preparations(chosen, base, runs)
     done = common.fill(path, chosen, work, finish, config=base, seeds=seeds, launch=launch, before=before)
-    write(out_path, scale, seeds)
+    write(out_path, scale, seeds, bases(base, scale))
     return done
+
+
+def bases(base, scale: str) -> dict[str, Any]:
+    """Give the config that each task's rows change: `base` for its own, for the others theirs with the scale, seed and place of `base`."""
+    flags = [f"eval.split={base.eval.split}", f"eval.start={base.eval.start}", f"seed={base.seed}"]
+    found = {name: common.shipped_config({"task": name}) for name in PUBLISHED if name in tasks.names() and name != base.task.name}
+    return {base.task.name: base} | {name: options.override(own, [*shared(own, scale), *flags]) for name, own in found.items()}
 
 
 PUBLISHED = ("tower", "pallet")  # the order in Entry.published
@@ -251,8 +258,7 @@ def run(row: Entry, base, directory: pathlib.Path, seeds: Sequence[int]) -> dict
 
 def backbone(config, directory: pathlib.Path) -> str:
     """Pre-train the backbone of all rows of a scale, once, and give the file of its weights."""
-    with cluster.exclusive(directory):
-        return str(pretrain.pretrain(config, str(directory)))
+    return str(pretrain.pretrain(config, str(directory)))
 
 
 def preparations(rows: Sequence[Entry], base, runs: str) -> list[common.Before]:
@@ -267,28 +273,32 @@ def preparations(rows: Sequence[Entry], base, runs: str) -> list[common.Before]:
 # The table and the bars
 
 
-def stored(out: pathlib.Path, scale: str, seeds: Sequence[int]) -> dict[str, dict[str, dict[str, Any]]]:
-    """Read the finished rows of a scale, in the table's order: `{task: {name: row}}`, without those of other settings or `seeds`."""
+def stored(out: pathlib.Path, scale: str, seeds: Sequence[int], bases: Mapping[str, Any]) -> dict[str, dict[str, dict[str, Any]]]:
+    """Read the finished rows of a scale, in the table's order: `{task: {name: row}}`, without those of other settings or `seeds`.
+
+    `bases` has the config that the rows of each task change.
+    """
     found = {}
-    for task in [name for name in PUBLISHED if name in tasks.names()]:
+    for task in [name for name in PUBLISHED if name in bases]:
         path = out / f"{scale}-{task}.json"
         rows = common.read(path)
-        fresh = {row.name: rows[row.name] for row in plan(scale) if row.name in rows and is_fresh(row, rows[row.name], seeds)}
+        fresh = {row.name: rows[row.name] for row in plan(scale) if row.name in rows and is_fresh(row, rows[row.name], bases[task], seeds)}
         if left := sorted(rows.keys() - fresh.keys()):
             print(f"left out of the table, as they are of other settings or seeds: {', '.join(left)} in {path}")
         found[task] = fresh
     return {task: rows for task, rows in found.items() if rows}
 
 
-def is_fresh(row: Entry, result: Mapping[str, Any], seeds: Sequence[int]) -> bool:
-    """Say whether a row of a file is what the table's row would give now, as far as it names that; files of CLIP may be anywhere."""
-    overrides = [text for text in result["overrides"][0] if not (row.clip and text.startswith("model.clip"))]
-    return overrides == list(row.overrides) and result.get("revision", 0) == row.revision and result["seeds"] == [seeds[0], seeds[-1]]
+def is_fresh(row: Entry, result: Mapping[str, Any], base, seeds: Sequence[int]) -> bool:
+    """Say whether a row of a file is what the table's row would give now; files of CLIP may be anywhere."""
+    files = [text for text in result["overrides"][0] if row.clip and text.startswith("model.clip")]
+    own = dataclasses.replace(row, overrides=(*row.overrides, *files))
+    return common.is_same(result, common.identity(own, base, seeds, weights=None))
 
 
-def write(out: pathlib.Path, scale: str, seeds: Sequence[int]) -> None:
-    """Write `<scale>.md` and `<scale>.webp` from the results of both tasks, and print the table."""
-    rows = stored(out, scale, seeds)
+def write(out: pathlib.Path, scale: str, seeds: Sequence[int], bases: Mapping[str, Any]) -> None:
+    """Write `<scale>.md` and `<scale>.webp` from the results of both tasks, whose rows change `bases`, and print the table."""
+    rows = stored(out, scale, seeds, bases)
     text = table(rows)
     (out / f"{scale}.md").write_text(text + "\n")
     try:

@@ -28,7 +28,11 @@ STATUS = pathlib.Path("/proc/self/status")  # where Linux says how much memory a
 
 
 class Unavailable(RuntimeError):
-    """What a stage needs is not on this machine."""
+    """What a stage needs is not on this machine; or the stage `failed`."""
+
+    def __init__(self, reason: str, *, failed: bool = False):
+        super().__init__(reason)
+        self.failed = failed
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,7 +122,7 @@ def timed(name: str, stages: Mapping[str, Stage], config, repeats: int, *, apart
     """Time a stage: a row with the median and the extremes of a thing in seconds; or why it could not run.
 
     With `apart` every stage has a process of its own, as a command has: what others left in memory is not in its way, and its own use of
-    memory can be told.
+    memory can be told. A row of a stage that broke down, took over LIMIT or more memory than there is, is also `failed`.
     """
     stage = stages[name]
     row = {"name": name, "label": stage.label, "unit": stage.unit}
@@ -129,7 +133,9 @@ def timed(name: str, stages: Mapping[str, Stage], config, repeats: int, *, apart
             return row | alone(name, stage, config, repeats)
         return row | measured(stage.prepare(config), repeats) | device_memory()
     except Unavailable as error:
-        return {**row, "unavailable": str(error)}
+        return {**row, "unavailable": str(error), **({"failed": True} if error.failed else {})}
+    except jax.errors.JaxRuntimeError as error:  # such as memory that a device does not have: the other stages count
+        return {**row, "unavailable": str(error).partition("\n")[0][:300], "failed": True}
 
 
 def device_memory() -> dict[str, float]:
@@ -150,10 +156,10 @@ def alone(name: str, stage: Stage, config, repeats: int) -> dict[str, Any]:
             command, input=request, capture_output=True, text=True, env={**stage.environment, **os.environ}, timeout=LIMIT, check=False
         )
     except subprocess.TimeoutExpired:
-        raise Unavailable(f"not done after {LIMIT:.0f} s") from None
+        raise Unavailable(f"not done after {LIMIT:.0f} s", failed=True) from None
     if done.returncode:
         last = (done.stderr.strip().splitlines() or [""])[-1]
-        raise Unavailable(f"ended with status {done.returncode}: {last[:300]}")
+        raise Unavailable(f"ended with status {done.returncode}: {last[:300]}", failed=True)
     row = json.loads(done.stdout.splitlines()[-1])
     if "unavailable" in row:
         raise Unavailable(row["unavailable"])

@@ -19,7 +19,7 @@ CANDIDATES = 64  # colours drawn uniformly, out of which those of the objects ar
 class Sensors:
     """How the cameras of a training example err; static."""
 
-    depth_noise: float = 0.0  # probability of an image with the noise of `perception.noise.depth_noise`
+    depth_noise: float = 0.0  # probability that all images have the noise of `perception.noise.depth_noise`
     shift: float = 0.0  # metres a camera is off where it is thought to be, at most
     turn: float = 0.0  # degrees a camera is turned off, at most
     missing: float = 0.0  # probability that one camera sees nothing

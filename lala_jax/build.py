@@ -188,10 +188,7 @@ def clip_identity(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _mix(config: Mapping[str, Any]) -> float:
-    share = config["augment"].get("mix", NEWER["augment.mix"])
-    if not 0.0 <= share <= 1.0:
-        raise options.OptionsError(f"config field augment.mix must be at least 0 and at most 1, got {share!r}")
-    return share
+    return _share("augment.mix", config["augment"].get("mix", NEWER["augment.mix"]))
 
 
 def _check_names(config: Mapping[str, Any]) -> None:
@@ -204,6 +201,26 @@ def _check_names(config: Mapping[str, Any]) -> None:
         raise options.OptionsError(f"model.name 'cliport' calls colours by their names: it needs task.colors {known}, got {colors!r}")
 
 
+def _check_numbers(config: Mapping[str, Any]) -> None:
+    """Raise where what is a probability is none, or what is a bound is below 0."""
+    for group, name in (("augment", "depth_noise"), ("augment", "missing"), ("optim", "average_decay")):
+        _share(f"{group}.{name}", config[group][name])
+    for name in ("shift", "turn"):
+        _not_negative(f"augment.{name}", config["augment"][name])
+    if not (clip := config["optim"]["clip"]) > 0.0:  # with 0 nothing is learnt
+        raise options.OptionsError(f"config field optim.clip must be above 0 (inf for no clipping), got {clip!r}")
+
+
+def check_evaluation(config: Mapping[str, Any]) -> None:
+    """Raise OptionsError where the groups `eval` and `data` say of how many episodes what cannot be, before hours of training."""
+    fields = config["eval"]
+    for name, value in (("eval.parallel", fields["parallel"]), ("data.threads", config["data"]["threads"])):
+        _positive(name, value)
+    _not_negative("eval.strips", fields["strips"])
+    options.check_choice("eval.split", fields["split"], SPLITS)
+    split_seeds(fields["split"], fields["start"], fields["episodes"])
+
+
 def recipe(config: Mapping[str, Any]) -> train_step.Recipe:
     """Build the training step's facts from the whole config."""
     train, augment = config["train"], config["augment"]
@@ -211,6 +228,9 @@ def recipe(config: Mapping[str, Any]) -> train_step.Recipe:
         _positive(f"train.{name}", train[name])
     if config["model"]["name"] == "cliport":
         _check_names(config)
+    _check_numbers(config)
+    check_evaluation(config)
+    split_seeds("val", SELECTION_START, train["eval_episodes"])
     sensors = train_step.augment.Sensors(**{name: augment[name] for name in ("depth_noise", "shift", "turn", "missing")})
     options.check_choice("optim.schedule", config["optim"]["schedule"], optim.SCHEDULES)
     return train_step.Recipe(
@@ -313,3 +333,14 @@ def split_seeds(split: str, start: int, count: int) -> list[int]:
 def _positive(name: str, value: float) -> None:
     if not np.isfinite(value) or value <= 0:
         raise options.OptionsError(f"config field {name} must be above 0, got {value!r}")
+
+
+def _not_negative(name: str, value: float) -> None:
+    if not np.isfinite(value) or value < 0:
+        raise options.OptionsError(f"config field {name} must be at least 0, got {value!r}")
+
+
+def _share(name: str, value: float) -> float:
+    if not 0.0 <= value <= 1.0:
+        raise options.OptionsError(f"config field {name} must be at least 0 and at most 1, got {value!r}")
+    return value

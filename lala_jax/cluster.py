@@ -15,6 +15,7 @@ import os
 import pathlib
 import re
 import shlex
+import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -155,7 +156,7 @@ def exclusive(path: pathlib.Path) -> Iterator[None]:
     """Hold `path` + `.lock` while the block runs, waiting for whoever holds it; it is let go when its holder dies, too."""
     import fcntl  # of POSIX
 
-    lock = path.with_name(path.name + ".lock")
+    lock = _lock_of(path)
     lock.parent.mkdir(parents=True, exist_ok=True)
     while True:
         with open(lock, "w") as file:  # for writing, as network file systems want it
@@ -173,6 +174,10 @@ def exclusive(path: pathlib.Path) -> Iterator[None]:
             return
 
 
+def _lock_of(path: pathlib.Path) -> pathlib.Path:
+    return path.with_name(path.name + ".lock")
+
+
 def _is_at(file: Any, path: pathlib.Path) -> bool:
     """Say whether an open file is the one at `path`."""
     try:
@@ -185,7 +190,8 @@ def run(launch: Launcher, tasks: Sequence[Task], folder: pathlib.Path) -> Iterat
     """Run tasks in workers and yield `(name, result)` as they come, first of those whose parts are there; logs go to `folder`.
 
     A task whose worker failed or was killed is run again, `retries` times. Where some are missing in the end, names them with the last
-    lines of their logs and raises SystemExit with status 1. Whoever leaves early cancels what still runs.
+    lines of their logs and raises SystemExit with status 1. Whoever leaves early cancels what still runs. Logs stay unless all is done,
+    and so do those of other commands that use the folder.
     """
     waiting: dict[str, Task] = {}
     for task in tasks:
@@ -195,7 +201,14 @@ def run(launch: Launcher, tasks: Sequence[Task], folder: pathlib.Path) -> Iterat
             yield task.name, found["result"]
     if not waiting:
         return
-    executor = launch.executor(folder / "logs" / f"{time.time():.0f}-{os.getpid()}")  # its own: files are named by numbers that come again
+    logs = folder / "logs" / f"{time.time():.0f}-{os.getpid()}"  # its own: files are named by numbers that come again
+    with exclusive(logs):  # so that `sweep` of another command leaves it
+        yield from _run(launch, waiting, launch.executor(logs), folder, len(tasks))
+    shutil.rmtree(logs, ignore_errors=True)
+
+
+def _run(launch: Launcher, waiting: dict[str, Task], executor: Any, folder: pathlib.Path, count: int) -> Iterator[tuple[str, Any]]:
+    """Submit what waits, of `count` tasks, and yield what comes of it."""
     running: dict[str, tuple[Task, Any]] = {}
     tries, missing = collections.Counter(), {}
     try:
@@ -217,8 +230,33 @@ def run(launch: Launcher, tasks: Sequence[Task], folder: pathlib.Path) -> Iterat
     finally:
         _cancel(launch, [job for _, job in running.values()])
     if missing:
-        _report(missing, len(tasks), folder)
+        _report(missing, count, folder)
         raise SystemExit(1)
+
+
+def sweep(folder: pathlib.Path) -> None:
+    """Remove the logs of ended commands and, where nothing is left in it, the folder of `run`; what other commands use stays."""
+    for logs in (folder / "logs").glob("*/"):
+        if not _is_held(logs):
+            shutil.rmtree(logs, ignore_errors=True)
+            _lock_of(logs).unlink(missing_ok=True)  # of a command that was killed
+    for one in (folder / "logs", folder):
+        with contextlib.suppress(OSError):
+            one.rmdir()
+
+
+def _is_held(path: pathlib.Path) -> bool:
+    """Say whether somebody has `exclusive` hold of a path."""
+    import fcntl
+
+    try:
+        with open(_lock_of(path), "r+") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except FileNotFoundError:
+        return False
+    except BlockingIOError:
+        return True
+    return False
 
 
 def _submit(launch: Launcher, executor: Any, waiting: dict[str, Task], running: dict[str, Any], missing: dict[str, str]) -> None:

@@ -78,7 +78,7 @@ def load(
 ) -> tuple[list[types.Demo], dict[str, Any]]:
     """Read the demonstrations (NumPy leaves, bit for bit as saved, in the order written) and the meta data.
 
-    meta: `version`, `task`, `task_options`, `demos` (number on disk). With `count` only the first that many are given, whole shards
+    meta: `version`, `task`, `task_options`, `demos` (number read). With `count` only the first that many are given, whole shards
     past them are not read. Raises DatasetError for a missing, truncated, changed or newer file, another task or other options than
     asked for, or fewer demonstrations than `count`.
     """

@@ -69,7 +69,7 @@ def get(arg: str, *, task: str) -> ml_collections.ConfigDict:
     config.augment.recolor = True
     config.augment.mix = 0.5  # probability that the new colours are drawn anywhere in RGB, and not from the palette
     config.augment.rigid = True
-    config.augment.depth_noise = 0.25  # probability of an image with depth noise
+    config.augment.depth_noise = 0.25  # probability of an example with depth noise
     config.augment.shift = 0.001  # metres: each camera is at most so far from where it is thought to be
     config.augment.turn = 0.1  # degrees, likewise
     config.augment.missing = 0.1  # probability that one camera sees nothing

@@ -15,7 +15,8 @@ from typing import Any
 
 from lala_jax import build, cluster, compiling, options, pretrained, scoring, writers
 
-FLAGS = {"checkpoint": "", "agent": "policy", "split": "", "start": -1, "episodes": 0, **cluster.FLAGS}
+UNSET = -1  # of a number: the config's
+FLAGS = {"checkpoint": "", "agent": "policy", "split": "", "start": UNSET, "episodes": UNSET, **cluster.FLAGS}
 NO_CHECKPOINT = "give --checkpoint=PATH, or --config=FILE.py with --agent=oracle, blind or top_view"
 
 
@@ -25,11 +26,14 @@ def main(
     """Score the checkpoint, or an agent that needs no training, and write scores and pictures to the work directory."""
     options.check_choice("--agent", agent, scoring.AGENTS)
     launch, split = cluster.launcher(launcher, launcher_options), split or config.eval.split
-    seeds = build.split_seeds(split, start if start >= 0 else config.eval.start, episodes or config.eval.episodes)
+    start, episodes = (config.eval[name] if given == UNSET else given for name, given in (("start", start), ("episodes", episodes)))
+    seeds = build.split_seeds(split, start, episodes)
+    build.check_evaluation(config)
     out = pathlib.Path(build.workdir(config, workdir))
     parts = out / f"scores-{agent}-{split}.parts"
     result, strips, weights = score(config, checkpoint, agent, seeds, launch, parts)
-    scoring.write_scores(config, result, strips, out, agent=agent, split=split, seeds=seeds, source=checkpoint or None, weights=weights)
+    source = checkpoint if agent == "policy" else None
+    scoring.write_scores(config, result, strips, out, agent=agent, split=split, seeds=seeds, source=source, weights=weights)
     if launch is not None:
         shutil.rmtree(parts)
     if agent == "policy" and not reproduced(checkpoint, config, split=split, seeds=seeds, result=result):

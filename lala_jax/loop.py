@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from rich import progress
 
-from lala_jax import checkpoint, compiling, options, parallel, state, writers
+from lala_jax import checkpoint, cluster, compiling, options, parallel, state, writers
 
 Metrics = Mapping[str, jax.Array]
 Step = Callable[[state.TrainState], tuple[state.TrainState, Metrics]]
@@ -40,6 +40,11 @@ def mean_metrics(seen: Sequence[Metrics], *, last: int) -> dict[str, float]:
         check_finite(number, metrics)
     columns = {name: np.array([metrics[name] for metrics in host]) for name in host[0]}
     return {name: float(np.nan if np.isnan(values).all() else np.nanmean(values)) for name, values in columns.items()}
+
+
+def alone(out: pathlib.Path) -> contextlib.AbstractContextManager[None]:
+    """Hold a run's work directory: another command that would write there waits. Of a run's processes the first does it for all."""
+    return cluster.exclusive(out) if parallel.is_first() else contextlib.nullcontext()
 
 
 @contextlib.contextmanager

@@ -137,12 +137,12 @@ def draw(key: jax.Array, state: types.State, *, spec: types.MapSpec, rotations: 
     pick = jnp.stack([flat // spec.cols, flat % spec.cols]).astype(jnp.int32)
     label = losses.place_label(state, index, types.world_from_index(spec, pick))
     bins, places, valid = losses.place_index(label, spec=spec, rotations=rotations)
+    drawn = candidates.any()
     pick_valid, pick_best = ((each & state.ready[:, None, None]).any(0) for each in (whole, middle))
     if not multi_action:
         least = jnp.argmin(jnp.where(valid, jnp.abs(jnp.mod(label.yaw + math.pi, 2 * math.pi) - math.pi), jnp.inf))
         valid = valid & (jnp.arange(valid.size) == least)
-        pick_valid = pick_best = jnp.zeros_like(pick_valid).at[pick[0], pick[1]].set(True)
-    drawn = candidates.any()
+        pick_valid = pick_best = jnp.zeros_like(pick_valid).at[pick[0], pick[1]].set(drawn)
     return Sample(pick_valid, pick_best, index, pick, drawn, label, bins, places, valid & drawn)
 
 

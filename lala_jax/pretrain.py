@@ -69,8 +69,13 @@ def trunk(recipe: pretrain_step.Recipe, params: Mapping[str, Any], frozen: Mappi
 
 
 def pretrain(config, workdir: str) -> pathlib.Path:
-    """Run what the config's `pretrain` group describes; returns the file of weights."""
+    """Run what the config's `pretrain` group describes; returns the file of weights. Waits as training does."""
     out, recipe = pathlib.Path(workdir), build.on_devices(build.pretrain_recipe(config), config, group="pretrain")
+    with loop.alone(out):
+        return _pretrain(config, recipe, out)
+
+
+def _pretrain(config, recipe: pretrain_step.Recipe, out: pathlib.Path) -> pathlib.Path:
     states = draw_states(config)
     fresh, frozen = start(config, recipe, states)
     if recipe.mesh is not None:

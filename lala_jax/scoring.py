@@ -136,12 +136,13 @@ def baseline(name: str, observer_task, *, seeds: Sequence[int], threads: int) ->
 def score_span(
     config, places: range, pictures_file: pathlib.Path, *, agent: str, path: str, weights: Mapping[str, Any] | None, seeds: Sequence[int]
 ) -> dict[str, Any]:
-    """Score an agent at some places of `seeds`, one of `spans`, and leave the pictures in an `.npz`.
+    """Score an agent at some places of `seeds`, one of `spans`, on this process's `device`, and leave the pictures in an `.npz`.
 
     Raises CheckpointError where the checkpoint at `path` no longer holds the `weights`.
     """
     if agent != "policy":
-        return baseline(agent, build.task(config), seeds=[seeds[place] for place in places], threads=config.data.threads)
+        found = baseline(agent, build.task(config), seeds=[seeds[place] for place in places], threads=config.data.threads)
+        return {**found, "device": jax.devices()[0].device_kind}
     built, observer = build.build_policy(config), build.observer(config)
     params = check_checkpoint(path, config, built)
     if (now := pretrained.fingerprint(path, params)) != weights:
@@ -152,13 +153,14 @@ def score_span(
     )  # fmt: skip
     with writers.atomic(pictures_file) as file:
         np.savez(file, **{f"{kind}-{number}": picture for (kind, number), picture in drawn.items()})
-    return result
+    return {**result, "device": jax.devices()[0].device_kind}
 
 
 def evaluate_in_parts(launch: cluster.Launcher, config, folder: pathlib.Path, **what) -> tuple[dict[str, Any], dict[tuple[str, int], Any]]:
-    """Give what `evaluate`, or `baseline`, gives, scored by workers; the parts stay in `folder` until the caller is done with them.
+    """Give what `evaluate`, or `baseline`, gives, scored by workers, and their `device`.
 
-    `what` says what is scored: `agent`, `path`, `weights` and `seeds` of `score_span`.
+    The parts stay in `folder` until the caller is done with them. `what` says what is scored: `agent`, `path`, `weights` and `seeds` of
+    `score_span`.
     """
     count, tasks = len(what["seeds"]), []
     for places in spans(count, config.eval.parallel, launch.workers):
@@ -168,7 +170,8 @@ def evaluate_in_parts(launch: cluster.Launcher, config, folder: pathlib.Path, **
         tasks.append(cluster.Task(f"episodes {name}", call, folder / f"{name}.json", key))
     found = dict(cluster.run(launch, tasks, folder))
     drawn = _gathered([task.part.with_suffix(".npz") for task in tasks]) if what["agent"] == "policy" else {}
-    return rollout.merged([found[task.name] for task in tasks]), drawn
+    scored = [found[task.name] for task in tasks]
+    return {**rollout.merged(scored), "device": ", ".join(sorted({one["device"] for one in scored}))}, drawn
 
 
 def _gathered(files: Sequence[pathlib.Path]) -> dict[tuple[str, int], np.ndarray]:
@@ -254,7 +257,7 @@ def write_scores(
     path = out / f"scores-{agent}-{split}.json"
     facts = {"agent": agent, "task": config.task.name, "split": split, "seeds": [seeds[0], seeds[-1]]}
     facts |= {"checkpoint": source, "weights": weights}
-    writers.write_json(path, {**facts, **result, "device": jax.devices()[0].device_kind, "config": options.to_dict(config)})
+    writers.write_json(path, {**facts, "device": jax.devices()[0].device_kind, **result, "config": options.to_dict(config)})
     low, high = result["interval95"]
     print(
         f"{config.task.name} {agent}, {split} split, {result['episodes']} episodes: score {result['score']:.1f} [{low:.1f}, {high:.1f}], "

@@ -49,9 +49,14 @@ def start_or_resume(config: Mapping[str, Any], recipe: train_step.Recipe, store:
 
 
 def train_and_evaluate(config, workdir: str) -> dict[str, Any]:
-    """Run everything a config describes; returns the final evaluation."""
+    """Run everything a config describes; returns the final evaluation. Waits for another command that has the same work directory."""
     out = pathlib.Path(workdir)
     recipe = build.on_devices(build.recipe(config), config, group="train")
+    with loop.alone(out):
+        return _train_and_evaluate(config, recipe, out)
+
+
+def _train_and_evaluate(config, recipe: train_step.Recipe, out: pathlib.Path) -> dict[str, Any]:
     states = load_states(config, recipe.mesh)
     store = checkpoint.Checkpoints(out / "checkpoints")
     run = start_or_resume(config, recipe, store)

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from lala_jax import options
+from lala_jax import build, options
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "lala_jax"
@@ -178,8 +178,10 @@ def test_there_are_configs():
 
 @pytest.mark.parametrize("option", OPTIONS, ids=[option or "default" for option in OPTIONS])
 @pytest.mark.parametrize("path", CONFIGS, ids=[path.stem for path in CONFIGS])
-def test_every_config_builds(path, option):
+def test_every_config_builds(path, option, monkeypatch):
     config = options.load(f"{path}:{option}" if option else str(path))
+    monkeypatch.setattr(build.observe.Observer, "check", lambda self: None)  # renders, at the config's resolution
+    assert build.recipe(config).batch_size == config.train.batch_size
     assert config.is_locked
     assert config.to_dict() == options.load(f"{path}:{option}").to_dict(), "building twice must give equal configs"
     if option:

@@ -254,8 +254,8 @@ def test_two_files_are_compared_by_ratio(monkeypatch, tmp_path, capsys):
     def timed(name, stages, config, repeats, *, apart):
         assert apart == (jax.default_backend() == "cpu")
         row = {"name": name, "label": stages[name].label, "unit": stages[name].unit, "runs": repeats, "recompiled": 0}
-        if name == "b" and taken["b"] is None:
-            return {**row, "unavailable": "no b here"}
+        if name == "b" and taken["b"] in (None, "broken"):
+            return {**row, "unavailable": "no b here"} | ({"failed": True} if taken["b"] else {})
         seconds = taken.get(name, 1.0)
         return {
             **row,
@@ -292,6 +292,15 @@ def test_two_files_are_compared_by_ratio(monkeypatch, tmp_path, capsys):
     taken["b"] = None
     benchmark.command(["--task=tower", f"--out={tmp_path}", f"--against={earlier}"])
     assert "| b | no b here |" in capsys.readouterr().out
+    taken["b"] = "broken"
+    with pytest.raises(SystemExit, match="1"):
+        benchmark.command(["--task=tower", f"--out={tmp_path}", f"--against={earlier}"])
+    assert "b no longer runs: no b here" in capsys.readouterr().out
+    path.write_text(json.dumps({**stored, "growth": [{"name": "views"}]}))
+    with pytest.raises(SystemExit, match="2"):
+        benchmark.command(["--task=tower", f"--out={tmp_path}"])
+    assert f"{path} holds how cost grows, which this leaves out: give --growth=true or another --out" in capsys.readouterr().err
+    assert json.loads(path.read_text())["growth"] == [{"name": "views"}]
 
 
 @pytest.mark.parametrize(
@@ -354,6 +363,20 @@ def test_some_targets_are_about_one_kind_of_machine():
     assert judge("render-mujoco", [], platform="gpu")[0]["unavailable"] == "about a CPU"
     fast = [{"name": name, "flops_per_second": value} for name, value in (("train-paper-network-bfloat16", 3.0), ("matmul-bfloat16", 10.0))]
     assert judge("train-paper-network-bfloat16", fast, platform="gpu")[1].endswith("| 30.0% | at least 35.0% | MISSED |")
+
+
+def test_a_stage_that_breaks_down_leaves_the_others(monkeypatch):
+    """In this process, as on a GPU: what takes more memory than there is. In one of its own: what ends badly or late."""
+
+    def broken(config):
+        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: too much\nand more")
+
+    stages = {"a": timing.Stage("a", "thing", broken)}
+    row = {"name": "a", "label": "a", "unit": "thing", "failed": True}
+    assert timing.timed("a", stages, None, 1) == {**row, "unavailable": "RESOURCE_EXHAUSTED: too much"}
+    done = types.SimpleNamespace(returncode=-9, stderr="")
+    monkeypatch.setattr(timing.subprocess, "run", lambda *_, **__: done)
+    assert timing.timed("a", stages, tiny_config(), 1, apart=True) == {**row, "unavailable": "ended with status -9: "}
 
 
 def test_a_stage_for_another_kind_of_machine_is_left_out():

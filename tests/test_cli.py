@@ -140,6 +140,14 @@ def refused(answer, *messages):
         ("model.name=lstm", ["model.name must be one of 'goal_aware', 'single', .*got 'lstm'"]),
         ("model.crop=6", ["goal_aware needs map rows, map cols and model.crop in multiples of 4, got 80, 40 and 6"]),
         ("map.cell=0.3", ["MapSpec.x .* not a whole number"]),
+        ("optim.clip=0.0", [r"config field optim.clip must be above 0 \(inf for no clipping\), got 0.0"]),
+        ("augment.missing=10.0", ["config field augment.missing must be at least 0 and at most 1, got 10.0"]),
+        ("augment.turn=-1.0", ["config field augment.turn must be at least 0, got -1.0"]),
+        ("data.threads=0", ["config field data.threads must be above 0, got 0"]),
+        ("eval.parallel=0", ["config field eval.parallel must be above 0, got 0"]),
+        ("eval.split=tset", ["eval.split must be one of 'train', 'val', 'test', got 'tset'; did you mean test"]),
+        ("eval.episodes=0", ["at least one seed, got start=0, count=0"]),
+        ("train.eval_episodes=1001", [r"the val split has 5000 seeds, asked for 4000\.\."]),
         ("optim.schedule=linear", ["optim.schedule must be one of 'cosine', 'constant', got 'linear'"]),
     ],
 )
@@ -165,6 +173,8 @@ def test_a_process_ends_with_status_2(tmp_path):
         (["--config=configs/tower.py", "--agent=random"], ["--agent must be one of 'policy', 'oracle', 'blind', 'top_view', got 'random'"]),
         (["--config=configs/tower.py", "--agent=oracle", "--split=dev"], ["split must be one of 'train', 'val', 'test', got 'dev'"]),
         (["--config=configs/tower.py", "--agent=oracle", "--start=4990"], [r"the val split has 5000 seeds, asked for 4990\.\."]),
+        (["--config=configs/tower.py", "--agent=oracle", "--start=-5"], ["a seed range needs start >= 0 .*, got start=-5"]),
+        (["--config=configs/tower.py", "--agent=oracle", "--episodes=0"], ["at least one seed, got start=0, count=0"]),
         (["--config=configs/tower.py:small"], [r"config argument must be one of \('', 'smoke', 'paper'\), got 'small'"]),
     ],
 )

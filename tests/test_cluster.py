@@ -64,6 +64,17 @@ def test_a_killed_or_stopped_task_is_run_again(local, tmp_path, capsys):
     again = [task(tmp_path, "late", cluster_tasks.ran, 7, key=1), *tasks[1:]]
     assert dict(cluster.run(local, again, tmp_path / "parts"))["late"] == 7  # a part of another key is not
     assert runs(tmp_path, "killed", "stopped", "late") == [2, 2, 2]
+    assert not list((tmp_path / "parts" / "logs").iterdir())  # nobody needs them
+    cluster.sweep(tmp_path / "parts")
+    assert sorted(path.name for path in (tmp_path / "parts").iterdir()) == ["killed.json", "late.json", "stopped.json"]
+    shutil.rmtree(tmp_path / "parts")
+    (tmp_path / "parts" / "logs" / "old").mkdir(parents=True)
+    with cluster.exclusive(tmp_path / "parts" / "logs" / "used"):
+        (tmp_path / "parts" / "logs" / "used").mkdir()
+        cluster.sweep(tmp_path / "parts")  # another command is at it
+        assert sorted(path.name for path in (tmp_path / "parts" / "logs").iterdir()) == ["used", "used.lock"]
+    cluster.sweep(tmp_path / "parts")
+    assert not (tmp_path / "parts").exists()
 
 
 def test_what_is_missing_is_named_and_the_rest_is_kept(local, tmp_path, capsys):
@@ -308,6 +319,7 @@ def test_what_rows_share_comes_before_them(monkeypatch, tmp_path):
 
     monkeypatch.setattr(recording, "collect", lambda config, **_: collected.append(config.data))
     monkeypatch.setattr(pretrain, "pretrain", lambda config, path: f"{path}/backbone.npz")
+    monkeypatch.setattr(common, "check_run", lambda *_: None)
     monkeypatch.setattr(common, "load_weights", lambda *_: (None, {"step": 1}))
     monkeypatch.setattr(common, "score", lambda config, params, seeds: summary(seeds))
     monkeypatch.setattr(train, "train_and_evaluate", fake)
@@ -440,6 +452,19 @@ def test_a_checkpoint_that_changes_meanwhile_is_noticed(tmp_path):
         scoring.score_span(config, range(1), tmp_path / "x.npz", agent="policy", path=str(tmp_path), weights=other, seeds=[1])
     with pytest.raises(scoring.checkpoint.CheckpointError, match="changed meanwhile"):
         robustness.run(robustness.ROWS[0], base=config, checkpoint=str(tmp_path), weights=other, seeds=[1])
+
+
+def test_the_device_is_that_of_the_workers(tmp_path, monkeypatch):
+    """Which the command, kept off accelerators, does not see."""
+    lines = [{"seed": 1, "score": 0.0, "complete": False, "actions": 1}, {"seed": 3, "score": 100.0, "complete": True, "actions": 1}]
+    counts = {name: {} for name in rollout.COUNTS}
+    found = [{"per_episode": [line], **counts, "device": device} for line, device in zip(lines, "ba", strict=True)]
+    monkeypatch.setattr(cluster, "run", lambda launch, tasks, folder: [(task.name, one) for task, one in zip(tasks, found, strict=True)])
+    config, local = tiny_config("eval.parallel=1"), cluster.Launcher("local", 2)
+    result, _ = scoring.evaluate_in_parts(local, config, tmp_path, agent="blind", path="", weights=None, seeds=[1, 3])
+    assert result["device"] == "a, b" and result["score"] == 50.0
+    scoring.write_scores(config, result, {}, tmp_path, agent="blind", split="val", seeds=[1, 3], source=None, weights=None)
+    assert json.loads((tmp_path / "scores-blind-val.json").read_text())["device"] == "a, b"
 
 
 def test_agents_without_weights_are_scored_by_workers(call, tmp_path):

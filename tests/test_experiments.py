@@ -1,6 +1,7 @@
 """The experiments: every row's config builds, finished rows are kept, intervals are what they say, and one series runs end to end."""
 
 import json
+import math
 
 import clip_reference
 import clip_tokens
@@ -13,7 +14,7 @@ from test_scoring import SINGLE, save
 from test_train_step import tiny_config
 
 from experiments import ablation, common, main_table, robustness, table1
-from lala_jax import build, observe, options, rollout, train, writers
+from lala_jax import build, checkpoint, observe, options, rollout, train, writers
 from lala_jax.sim import tasks
 
 SEEDS = [1, 3, 5]
@@ -158,7 +159,9 @@ def test_what_identifies_a_row(tmp_path):
 
     assert ran() and not ran()
     assert not ran(tiny_config("eval.parallel=3", "data.threads=2", "train.log_every=9"))  # makes no difference
-    assert ran(tiny_config("camera.turn=1.0")) and ran()
+    moved = "camera.turn=1.0"
+    assert ran(tiny_config(moved)) and not ran(tiny_config(moved, "data.threads=2")) and ran()
+    assert ran(tiny_config(moved)) and ran(tiny_config(moved, "eval.parallel=3")) and ran()  # how the cameras err is drawn otherwise
     assert ran(tiny_config("train.eval_every=7")) and ran()  # another checkpoint may be the best
     assert ran(weights=weights) and not ran(weights=dict(weights)) and ran(weights={**weights, "crc32": 8}) and ran()
     older = json.loads(path.read_text())
@@ -218,6 +221,21 @@ def test_intervals_of_differences():
     np.testing.assert_allclose([apart["mean"], *apart["interval95"]], (a - b).mean() + np.array([0, -half, half]))
     with pytest.raises(ValueError, match="the same seeds"):
         common.difference(first, {"1": 2.0}, paired=True)
+
+
+@pytest.mark.parametrize(("one", "other"), [(100.0, 100.0), (60.0, 90.0), (0.0, 100.0)])
+def test_intervals_of_differences_without_spread(one, other):
+    """Means under which so many equal differences have a chance of 2.5% are the ends: all else at the other end of what is possible."""
+    first, second = ({str(seed): value for seed in range(9)} for value in (one, other))
+    found, same = common.difference(first, second, paired=True), one - other
+    low, high = found["interval95"]
+    assert found["mean"] == same
+    for end, farthest in ((low, -100.0), (high, 100.0)):
+        share = (end - farthest) / (same - farthest) if same != farthest else 0.025 ** (1 / 9)
+        assert share**9 == pytest.approx(0.025)
+    down, up = (np.subtract(rollout.interval([score] * 9), score) for score in (one, other))
+    apart = common.difference(first, second, paired=False)["interval95"]
+    np.testing.assert_allclose(apart, [same - math.hypot(down[0], up[1]), same + math.hypot(down[1], up[0])])
 
 
 def test_quarters_are_dealt_in_order():
@@ -283,21 +301,22 @@ def told(seeds, score):
 
 
 def test_the_ablation_trains_each_row_once(trains, monkeypatch, tmp_path, capsys):
-    loaded = []
+    loaded, checked = [], []
     monkeypatch.setattr(common, "load_weights", lambda path, *_: (loaded.append(path), {"step": 5, "crc32": 1}))
+    monkeypatch.setattr(common, "check_run", lambda path, config: checked.append((path, config.train.steps)))
     monkeypatch.setattr(common, "score", lambda config, _, seeds: told(seeds, 95.0 if config.model.average_turns else 0.0))
     given = ["--task=tower", "--steps=5", "--episodes=4", "--seed=2", f"--workdir={tmp_path / 'runs' / '<task>'}", f"--out={tmp_path}"]
     rows = ablation.command([*given, "--rows=one-hot,average-turns"])
     runs = tmp_path / "runs" / "tower"
     assert [name for name, _ in trains] == [str(runs / "default"), str(runs / "one-hot-r1")]
-    assert loaded == [str(runs / "default" / "checkpoints")]
+    assert loaded == [str(runs / "default" / "checkpoints")] and checked == [(loaded[0], 5)]
     for _, config in trains:
         assert (config.train.steps, config.train.eval_every, config.seed, config.data.demos) == (5, 5, 2, 500)
         assert (config.eval.split, config.eval.start, config.eval.episodes) == ("val", 100, 4)
     assert [row["difference"]["mean"] for row in rows[1:]] == [-30, 5] and rows[1]["train_seconds"] == 10
     stored = json.loads((tmp_path / "ablation-tower.json").read_text())
     assert stored["steps"] == 5 and [row["seeds"] for row in stored["rows"]] == [[201, 207]] * 3
-    assert "| one-hot labels | 62.0 [60.9, 63.1] | 0% | -30.0 [-30.0, -30.0] | 10 |" in capsys.readouterr().out
+    assert "| one-hot labels | 62.0 [60.9, 63.1] | 0% | -30.0 [-72.2, +48.3] | 10 |" in capsys.readouterr().out
     ablation.command([*given, "--rows=one-hot,slices"])
     assert [name for name, _ in trains[2:]] == [str(runs / "slices")]
 
@@ -337,11 +356,26 @@ def test_the_table_holds_every_row_of_both_tasks(trains, monkeypatch, tmp_path, 
     older = json.loads(path.read_text())
     older["rows"][0]["overrides"][0].append("model.width=9")
     older["rows"][1]["seeds"] = [1, 5]
+    older["rows"][2]["config"]["train"]["steps"] = 3  # of the scale, which was another then
     path.write_text(json.dumps(older))
-    table1.write(tmp_path, "smoke", [10_001, 10_002])
-    assert "left out of the table, as they are of other settings or seeds: graph, ours in " in capsys.readouterr().out
+    table1.write(tmp_path, "smoke", [10_001, 10_002], bases())
+    assert "left out of the table, as they are of other settings or seeds: blind, graph, ours in " in capsys.readouterr().out
     named = [line.split("|")[1].strip() for line in (tmp_path / "smoke.md").read_text().splitlines()[2:]]
-    assert named == [entry.label for entry in table1.ROWS if entry.name in ("two-stream", "blind", "top_view")]
+    assert named == [entry.label for entry in table1.ROWS if entry.name in ("two-stream", "top_view")]
+
+
+def bases():
+    """The configs that the rows of both tasks change, at the smallest scale."""
+    config = shipped("tower")
+    return table1.bases(options.override(config, [*table1.shared(config, "smoke"), "eval.split=test"]), "smoke")
+
+
+def test_the_checkpoint_of_another_run_is_not_taken_for_the_first_rows(tmp_path):
+    config = tiny_config(*SINGLE)
+    save(tmp_path, config)
+    common.check_run(str(tmp_path), options.override(config, ["eval.parallel=3"]))
+    with pytest.raises(checkpoint.CheckpointError, match=r"is of a run with another seed \(0 there, 4 here\)"):
+        common.check_run(str(tmp_path), options.override(config, ["seed=4"]))
 
 
 def test_bars_are_as_long_as_the_scores(tmp_path):

@@ -5,6 +5,7 @@ import json
 import os
 import re
 import signal
+import threading
 import types
 
 import jax
@@ -13,7 +14,7 @@ import numpy as np
 import optax
 import pytest
 
-from lala_jax import checkpoint, loop, options, state, writers
+from lala_jax import checkpoint, loop, options, pretrain, state, train, writers
 
 CONFIG = options.from_dict({"train": {"rate": 0.5, "log_every": 2}})
 STORED = {"config": options.to_dict(CONFIG), "input_spec": {}}
@@ -158,3 +159,31 @@ def test_only_settings_that_count_are_compared(tmp_path):
     np.testing.assert_array_equal(found.params["w"], 8.0)
     with pytest.raises(checkpoint.CheckpointError, match=r"another train.rate \(0.5 there, 0.25 here\): choose another --workdir"):
         loop.start_or_resume(fresh(), store, options.override(CONFIG, ["train.rate=0.25"]), settings)
+
+
+@pytest.mark.parametrize(
+    ("module", "function", "first"), [(train, "train_and_evaluate", "load_states"), (pretrain, "pretrain", "draw_states")]
+)
+def test_a_second_command_on_a_work_directory_waits(module, function, first, tmp_path, monkeypatch):
+    """Until the first lets it go, and reads nothing before."""
+    began = threading.Event()
+
+    def begin(*_):
+        began.set()
+        raise RuntimeError("far enough")
+
+    monkeypatch.setattr(module, first, begin)
+    monkeypatch.setattr(module.build, "recipe", lambda _: None)
+    monkeypatch.setattr(module.build, "pretrain_recipe", lambda _: None)
+    monkeypatch.setattr(module.build, "on_devices", lambda *_, **__: types.SimpleNamespace(mesh=None))
+
+    def second():
+        with pytest.raises(RuntimeError, match="far enough"):
+            getattr(module, function)(None, str(tmp_path / "run"))
+
+    thread = threading.Thread(target=second)
+    with loop.alone(tmp_path / "run"):
+        thread.start()
+        assert not began.wait(0.3)
+    thread.join(60)
+    assert began.is_set() and not list(tmp_path.iterdir())

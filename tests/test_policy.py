@@ -127,6 +127,11 @@ def test_draw_of_nothing_is_said():
         assert not sample.drawn and not sample.valid.any()
 
 
+def test_one_hot_marks_no_pick_where_there_is_nothing_to_draw():
+    (sample,) = draws(state_of(0, objects=3, done=1), [False, False, False], multi_action=False, count=1)
+    assert not sample.drawn and not sample.pick_best.any() and not sample.pick_valid.any()
+
+
 def test_one_hot_marks_one_pick_and_the_place_of_least_turn():
     state = state_of(0, objects=3, done=1)
     for sample in draws(state, state.ready, multi_action=False):
