@@ -99,7 +99,10 @@ def observer(config: Mapping[str, Any]) -> observe.Observer:
     surface(config)
     built = observe.Observer(task=task(config), spec=map_spec(config), dtype=network_dtype(config), **fields)
     options.check_choice("camera.missing", built.missing, range(-1, len(built.camera.intrinsics)))
-    built.check()
+    try:
+        built.check()
+    except ValueError as error:
+        raise options.OptionsError(f"camera.preset {built.preset!r}: {error}") from error
     return built
 
 

@@ -11,7 +11,6 @@ import numpy as np
 
 from lala_jax import backbone, checkpoint, clip_file, options, policy_cliport, wording
 from lala_jax.models import bert
-from lala_jax.sim import tasks
 from lala_jax.sim.tasks import base
 
 TRUNK = "resnet50_imagenet_v1"
@@ -24,9 +23,9 @@ def load(task_name: str, count: int, *, weights: str = "", tokenizer: str = "", 
     They are ImageNet's and MiniLM's, or, of CLIP's files `weights` and `tokenizer`, CLIP's with so many `stages` of its trunk. Raises
     OptionsError for a task without a sentence and for what is not installed, CheckpointError for files that cannot be used.
     """
-    known = [name for name in tasks.names() if hasattr(tasks.get(name), "sentence")]
-    if task_name not in known:
-        raise options.OptionsError(f"model.name 'cliport' needs a task.name with a sentence: {', '.join(known)}, got {task_name!r}")
+    if task_name not in wording.TASKS:
+        known = ", ".join(wording.TASKS)
+        raise options.OptionsError(f"model.name 'cliport' needs a task.name with a sentence: {known}, got {task_name!r}")
     try:
         if weights:
             net, variables = clip_file.load(weights)

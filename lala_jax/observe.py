@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from lala_jax import backbone, types
@@ -17,6 +18,7 @@ from lala_jax.sim import distance, render, scene
 from lala_jax.sim.tasks import base
 
 BASELINE = 0.055  # metres between the two imagers of a RealSense D415
+SEEN = 0.01  # share of a camera's pixels that must show the map's area
 SCENES = 16  # whose features are computed at once, where they are: 300 MB each at 640 x 480
 
 Whole = Callable[[Callable[[jax.Array], jax.Array], jax.Array], jax.Array]
@@ -148,8 +150,18 @@ class Observer:
         return Rig(believed, layer)
 
     def check(self) -> None:
-        """Raise ValueError naming the first camera of the preset that sees nothing of the table or the arm."""
-        render.check_views(self.background())
+        """Raise ValueError naming the first camera of the preset that sees nothing, or nothing of the map's area."""
+        layer, camera, spec = self.background(), self.camera, self.spec
+        render.check_views(layer)
+        u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+        leaves = (np.asarray(leaf) for leaf in (layer.depth, camera.intrinsics, camera.world_from_cam))
+        for number, (depth, intrinsics, pose) in enumerate(zip(*leaves, strict=True)):
+            rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(intrinsics).T
+            x, y, _ = np.moveaxis((rays * depth[..., None]) @ pose[:3, :3].T + pose[:3, 3], -1, 0)
+            share = ((depth > 0) & (x >= spec.x[0]) & (x < spec.x[1]) & (y >= spec.y[0]) & (y < spec.y[1])).mean()
+            if share < SEEN:
+                seen = f"the map's area, x {spec.x} and y {spec.y}, in {share:.2%} of its pixels, not {SEEN:.0%}"
+                raise ValueError(f"camera {number} sees {seen}: where does it look?")
 
 
 _load = functools.lru_cache(maxsize=2)(lambda name, stage, dtype: backbone.load(name, stage=stage, dtype=jnp.dtype(dtype)))

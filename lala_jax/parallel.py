@@ -55,7 +55,11 @@ def launched(environ: Mapping[str, str]) -> dict[str, Any] | None:
         count = _number(environ, "OMPI_COMM_WORLD_SIZE")
     else:
         indexed = {"KUBERNETES_SERVICE_HOST", "JOB_COMPLETION_INDEX"} <= environ.keys()
-        return {} if indexed and importlib.util.find_spec("kubernetes") else None
+        if indexed and importlib.util.find_spec("kubernetes"):
+            return {}
+        if address is not None:  # what a scheduler would tell is missing
+            raise options.OptionsError(f"the environment sets some, but not all of {', '.join(EXPLICIT)}")
+        return None
     return {"num_processes": count} if count > 1 else None
 
 

@@ -123,7 +123,7 @@ def heatmap_overlay(image: np.ndarray, logits, *, strength: float = 0.85) -> np.
         ValueError: NaN, +inf or no finite logit, or the shapes do not fit.
     """
     logits = np.asarray(logits, np.float32)
-    if logits.ndim != 2 or image.shape[0] * logits.shape[0] != image.shape[1] * logits.shape[1]:
+    if logits.ndim != 2 or abs(image.shape[0] - image.shape[1] * logits.shape[1] / logits.shape[0]) > 0.5:  # of a pixel, as `resize` rounds
         raise ValueError(f"logits [rows, cols] {logits.shape} do not fit the picture [cols, rows, 3] {image.shape}")
     if np.isnan(logits).any() or not np.isfinite(logits.max()):
         raise ValueError(f"logits {logits.shape} hold NaN, +inf or nothing finite")

@@ -19,14 +19,15 @@ from lala_jax.sim.tasks import base
 SHARD = 10  # demonstrations written at a time
 PATIENCE = 8.0  # further actions granted for each spoiled one that is expected
 MIN_SCORE = 99.0  # a demonstration below is not kept
+HOPE = 30  # scenes, of which the oracle must solve one
 
 
 def collect(config: Mapping[str, Any], *, quiet: bool = False, launch: cluster.Launcher | None = None) -> pathlib.Path:
     """Complete the dataset of the config to `data.demos` demonstrations of train seeds and give its directory.
 
     Goes on where an earlier run stopped, and waits for another that is at it; a directory that has enough is left alone. With `launch`
-    workers record the shards, and the files are the same. Raises `dataset.DatasetError` where the directory holds another task,
-    `options.OptionsError` where the train split runs out of seeds.
+    workers record the shards, and the files are the same. Raises `dataset.DatasetError` where the directory holds another task and
+    where the oracle solves none of the first `HOPE` scenes, `options.OptionsError` where the train split runs out of seeds.
     """
     directory, identity = pathlib.Path(config["data"]["directory"]), build.data_identity(config)
     done = dataset.seeds(directory)
@@ -55,8 +56,23 @@ def _complete(config, directory: pathlib.Path, identity: Mapping[str, Any], *, q
                     dataset.append(directory, demos, **identity)
                 kept += len(demos)
                 bar.update(shown, completed=kept)
+                if not kept and place >= HOPE:
+                    raise dataset.DatasetError(_why(config, build.split_seeds("train", 0, SHARD)))
     if launch is not None:
         shutil.rmtree(_parts(directory), ignore_errors=True)
+
+
+def _why(config, seeds: list[int]) -> str:
+    """Say how the oracle fails on scenes of which it solves none."""
+    task = build.task(config)
+    text = f"the oracle solves none of the first {HOPE} scenes of task {task.name}"
+    try:
+        result = rollout.summary(_attempt(task, seeds, threads=config["data"]["threads"], mistakes=build.mistakes(config)))
+    except base.NoFreePose as error:
+        return f"{text}: {error}"
+    counts = {name: count for field in ("actions_by_cause", "failures_by_reason") for name, count in result[field].items() if count}
+    told = ", ".join(f"{name} {count}" for name, count in counts.items())
+    return f"{text}: in {result['episodes']} of them it scores {result['score']:.0f}; its {result['actions']} actions were {told}"
 
 
 def plan(place: int, count: int) -> list[list[int]]:
@@ -110,16 +126,25 @@ def demonstrate(task: base.Task, seeds: list[int], *, threads: int, mistakes: fl
 
     Seeds whose scene has no free pose are passed over.
     """
-    scenes, usable = [], []
+    try:
+        episodes = _attempt(task, seeds, threads=threads, mistakes=mistakes)
+    except base.NoFreePose:
+        return []
+    return [episode.demo() for episode in episodes if episode.score > MIN_SCORE and np.isfinite(episode.poses).all()]
+
+
+def _attempt(task: base.Task, seeds: list[int], *, threads: int, mistakes: float) -> list[rollout.Episode]:
+    """Give the oracle's episodes in the scenes of `seeds` that have room for all objects; raises NoFreePose where none has."""
+    scenes, usable, crowded = [], [], None
     for seed in seeds:
         try:
             scenes.append(task.sample(seed))
-        except base.NoFreePose:
+        except base.NoFreePose as error:
+            crowded = error
             continue
         usable.append(seed)
-    if not usable:
-        return []
+    if crowded is not None and not usable:
+        raise crowded
     agent = rollout.erring_agent(task, scenes, usable, share=mistakes)
-    budget = math.ceil((task.max_actions or task.default_max_actions()) * (1.0 + PATIENCE * mistakes))
-    episodes = rollout.run(task, scenes, usable, agent, threads=threads, max_actions=budget)
-    return [episode.demo() for episode in episodes if episode.score > MIN_SCORE and np.isfinite(episode.poses).all()]
+    budget = math.ceil(task.budget * (1.0 + PATIENCE * mistakes))
+    return rollout.run(task, scenes, usable, agent, threads=threads, max_actions=budget)

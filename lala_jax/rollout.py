@@ -69,7 +69,7 @@ def run(
         _record(task, episode, world.poses())
     running = [i for i, episode in enumerate(episodes) if not episode.complete]
     stepper = physics.Worlds(worlds, threads=threads)
-    for _ in range(task.max_actions if max_actions is None else max_actions):
+    for _ in range(task.budget if max_actions is None else max_actions):
         if not running:
             break
         chosen = agent(running, np.stack([episodes[i].poses[-1] for i in running]))

@@ -14,6 +14,7 @@ from flax import struct
 
 from lala_jax.sim.tasks import base, tower
 
+TASKS = (tower.TowerTask.name,)  # whose goals can be said
 Encode = Callable[[str], Sequence[int]]
 
 
@@ -23,8 +24,8 @@ def sentence(task_name: str, colors: Sequence[str]) -> str:
     Raises ValueError for a task without a sentence (the paper ran its language baseline on the tower only), an unknown colour
     and no colours.
     """
-    if task_name != tower.TowerTask.name:
-        raise ValueError(f"task {task_name!r} has no sentence: the paper gives one for {tower.TowerTask.name!r} only")
+    if task_name not in TASKS:
+        raise ValueError(f"task {task_name!r} has no sentence: the paper gives one for {', '.join(map(repr, TASKS))} only")
     unknown = sorted(set(colors) - set(base.COLORS))
     if unknown or not colors:
         raise ValueError(f"a sentence needs colours out of {', '.join(base.COLORS)}, got {', '.join(unknown) or 'none'}")

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from test_train_step import tiny_config
 
 from lala_jax import backbone, build, defaults, losses, observe, options, types
 from lala_jax.perception import topdown
@@ -80,6 +81,23 @@ def test_the_arm_at_home_is_in_the_background():
 def test_unknown_preset_names_the_choices():
     with pytest.raises(ValueError, match="paper, ring"):
         observer(preset="rnig").check()
+
+
+def test_cameras_that_look_past_the_map_are_named(monkeypatch):
+    """Of a table that goes on for ever each sees something."""
+    eyes, target = scene.PRESETS["ring"]
+    away = [*eyes[:3], (6.0, 0.0, 0.75)]
+    monkeypatch.setitem(scene.PRESETS, "away", (eyes, (5.0, 0.0, 0.0)))
+    monkeypatch.setitem(scene.PRESETS, "one", (away, target))
+    area = r"sees the map's area, x \(0.25, 0.75\) and y \(-0.5, 0.5\), in [0-9.]+% of its pixels, not 1%"
+    with pytest.raises(ValueError, match=f"camera 0 {area}"):
+        observer(preset="away").check()
+    with pytest.raises(ValueError, match=f"camera 3 {area}"):
+        observer(preset="one").check()
+    for preset in ("ring", "paper"):
+        observer(preset=preset).check()
+    with pytest.raises(options.OptionsError, match=f"camera.preset 'away': camera 0 {area}"):
+        build.observer(tiny_config("camera.preset=away"))
 
 
 TOWER = observe.Observer(tasks.get("tower", num_objects=2), SPEC, height=240, width=320)

@@ -244,6 +244,7 @@ def test_what_the_environment_says(environ, told):
     ("change", "message"),
     [
         ({"JAX_PROCESS_ID": None}, "some, but not all of JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES, JAX_PROCESS_ID"),
+        ({"JAX_NUM_PROCESSES": None, "JAX_PROCESS_ID": None}, "some, but not all of JAX_COORDINATOR_ADDRESS"),  # nor any scheduler
         ({"JAX_PROCESS_ID": "2"}, "JAX_PROCESS_ID must be from 0 to JAX_NUM_PROCESSES - 1 = 1, got 2"),
         ({"JAX_NUM_PROCESSES": "two"}, "JAX_NUM_PROCESSES must be a whole number, got 'two'"),
     ],

@@ -161,6 +161,8 @@ def test_panel_and_strip_show_all_parts():
     now, goal = views(color=RED), views(color=BLUE)
     panel = pictures.step_panel(now, goal, empty_map(), empty_map(), pick, place, action(), SPEC, "step 1", width=640)
     assert panel.dtype == np.uint8 and panel.shape[1] == 640
+    odd = pictures.step_panel(now, goal, empty_map(), empty_map(), pick, place, action(), SPEC, "step 1", width=650)
+    assert odd.shape[1] == 650  # a half of 323 pixels, whose map is 161.5 high
     left, right = panel[:, :318], panel[:, 322:]
     assert (left == (255, 0, 0)).all(-1).sum() == (right == (0, 0, 255)).all(-1).sum() > 60_000
     assert not (left == (0, 0, 255)).all(-1).any()

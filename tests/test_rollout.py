@@ -11,6 +11,7 @@ from scipy import stats
 
 from lala_jax import build, dataset, defaults, options, recording, rollout, types
 from lala_jax.sim import oracle, physics, tasks
+from lala_jax.sim.tasks import base, tower
 
 
 def run(task, seeds, agent=None, **options):
@@ -255,6 +256,26 @@ def test_two_collections_of_one_directory_take_turns(tmp_path, monkeypatch):
         one.join()
     assert sorted(dataset.seeds(tmp_path / "d")) == [0, 2]
     assert not list(tmp_path.glob("*.lock"))
+
+
+def test_a_task_that_the_oracle_cannot_solve_is_given_up(tmp_path, monkeypatch):
+    """After some scenes, saying what happened; not after all of them."""
+    monkeypatch.setattr(recording, "HOPE", 4)
+    monkeypatch.setattr(recording, "SHARD", 2)
+    config = options.load("configs/tower.py:smoke", [f"data.directory={tmp_path / 'd'}", "data.demos=5", "task.num_objects=2"])
+    with monkeypatch.context() as heavy:
+        heavy.setattr(tower.TowerTask, "object_mass", lambda self, scene: np.full(len(scene.size), 5.0))  # more than the cup holds
+        told = "the oracle solves none of the first 4 scenes of task tower: in 2 of them it scores 0; its 6 actions were .*lost on the way"
+        with pytest.raises(dataset.DatasetError, match=told):
+            recording.collect(config, quiet=True)
+    crowded = base.NoFreePose("no free pose for object 1")
+    monkeypatch.setattr(tower.TowerTask, "build", lambda self, rng: throw(crowded))
+    with pytest.raises(dataset.DatasetError, match="the oracle solves none of the first 4 scenes of task tower: no free pose for object 1"):
+        recording.collect(config, quiet=True)
+
+
+def throw(error):
+    raise error
 
 
 def slowly(call, *args, **kwargs):

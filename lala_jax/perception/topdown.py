@@ -81,7 +81,12 @@ def from_views(
 
     `views.rgb` is `[V, H, W, 3]` in 0..1 and `views.depth` `[V, H, W]` in metres along the camera's z, 0 where nothing was measured; the
     cameras' poses are in the frame of the map: the robot's base, x forward, z up, the table at z = 0. The margins are those of `fuse`.
+    Raises ValueError for whole numbers.
     """
+    for name, leaf in (("rgb", views.rgb), ("depth", views.depth)):
+        if not jnp.issubdtype(leaf.dtype, jnp.floating):  # of 0..255, or millimetres
+            unit = "in 0..1" if name == "rgb" else "metres"
+            raise ValueError(f"views.{name} must be floating point, {unit}, got {leaf.dtype}")
     points = jax.vmap(cameras.unproject)(views.depth, views.camera)
     values = views.rgb if features is None else jnp.concatenate([views.rgb, features], axis=-1)
     return fuse(

@@ -23,6 +23,7 @@ TIMESTEP = 0.004  # seconds
 # Contacts this stiff let a block sink in by less than 0.01 mm under its own weight; MuJoCo's defaults let a tower of five sag by 2 mm.
 SOLREF = (0.008, 1.0)
 SOLIMP = (0.99, 0.999, 0.001, 0.5, 2.0)
+TRIES = 100  # scenes, of which one has room for its objects
 IMPRATIO = 10.0  # friction stiffer than the normal force: nothing creeps
 FRICTION = (1.0, 0.005, 0.0001)  # sliding; torsional and rolling in metres
 TABLE_COLOR = (51 / 255, 51 / 255, 51 / 255)
@@ -65,7 +66,10 @@ def build_spec(task: base.Task, scene: types.Scene, *, cameras: types.Camera | N
     spec.worldbody.add_geom(name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 0.05], rgba=[*TABLE_COLOR, 1.0])
     size, start, color = (np.asarray(leaf, np.float64) for leaf in (scene.size, scene.start, scene.color))
     _add_box(spec, "base", np.asarray(scene.base, np.float64), task.base_size, task.base_color)
-    for i, mass in enumerate(task.object_mass(scene)):
+    masses = np.asarray(task.object_mass(scene))
+    if masses.shape != (len(size),):
+        raise ValueError(f"task {task.name}: object_mass must give one mass for each of {len(size)} objects, got shape {masses.shape}")
+    for i, mass in enumerate(masses):
         _add_box(spec, f"object{i}", start[i], size[i], color[i], mass=mass)
     robot.add_ur5e(spec)
     for geom in spec.geoms:
@@ -140,12 +144,22 @@ def static_geoms(model: mujoco.MjModel | mjx.Model) -> tuple[int, ...]:
     return tuple(i for i in range(model.ngeom) if i not in moving)
 
 
+def _any_scene(task: base.Task) -> types.Scene:
+    """Give the first scene of a task that has room for its objects."""
+    for seed in range(TRIES):
+        try:
+            return task.sample(seed)
+        except base.NoFreePose:
+            continue
+    raise base.NoFreePose(f"task {task.name}: none of the first {TRIES} scenes has a free pose for every object")
+
+
 @functools.cache
 def geom_template(task: base.Task) -> tuple[mjx.Model, mjx.Data]:
     """Give a task's MJX model and data with the arm at home, as a canvas for `place`; for looking at only, it has no contacts."""
     from lala_jax.sim.quiet import mjx  # slow to import, and only the renderer's side needs it
 
-    model = build_model(task, task.sample(0))
+    model = build_model(task, _any_scene(task))
     model.geom_contype[:] = 0
     model.geom_conaffinity[:] = 0
     data = mujoco.MjData(model)

@@ -231,6 +231,15 @@ def test_from_views_equals_fuse_of_the_slow_points():
     np.testing.assert_allclose(np.asarray(fused.skin)[same.all(-1)], slow.skin[same.all(-1)], atol=1e-4)
 
 
+@pytest.mark.parametrize(("name", "dtype", "unit"), [("rgb", jnp.uint8, "in 0..1"), ("depth", jnp.uint16, "metres")])
+def test_whole_numbers_of_real_cameras_are_refused(name, dtype, unit):
+    """Colours of 0..255 and millimetres would be taken for colours in 0..1 and metres."""
+    views = table_views()
+    raw = views.replace(**{name: (255 * getattr(views, name)).astype(dtype)})
+    with pytest.raises(ValueError, match=rf"views.{name} must be floating point, {unit}, got {jnp.dtype(dtype).name}"):
+        topdown.from_views(raw, spec=SPEC)
+
+
 def test_the_order_of_views_does_not_matter():
     first = from_views(table_views(), spec=SPEC)
     second = from_views(table_views((2, 0, 3, 1)), spec=SPEC)

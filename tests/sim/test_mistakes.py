@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from sim.test_oracle import carried, under
+from sim.test_tasks import DISTRACTED
 
 from lala_jax.perception import transforms
 from lala_jax.sim import mistakes, oracle, tasks
@@ -18,7 +19,7 @@ def half_built(name, seed, **options):
     return task, scene, poses
 
 
-@pytest.mark.parametrize("name", tasks.names())
+@pytest.mark.parametrize("name", DISTRACTED)
 def test_every_mistake_is_of_its_kind_and_wrong(name):
     seen = set()
     for seed in range(20):
@@ -47,7 +48,8 @@ def test_every_mistake_is_of_its_kind_and_wrong(name):
                         assert target != index and free[target]
                     else:
                         assert (pose == goal[index]).all() and not (before & oracle.wanted(scene))[moved]
-    assert seen == {"tower": {"beside", "another"}, "pallet": {"turned", "beside", "elsewhere", "another"}}[name]
+    kinds = {"tower": {"beside", "another"}, "pallet": {"turned", "beside", "elsewhere", "another"}}
+    assert seen == kinds.get(name, seen) != set()
 
 
 def test_what_would_topple_is_told():

@@ -96,10 +96,9 @@ def test_a_template_first_asked_for_inside_jit_keeps_no_tracers():
     np.testing.assert_allclose(jax.jit(height)(poses), height(poses), rtol=1e-6)
 
 
-@pytest.mark.parametrize("preset", sorted(scenes.PRESETS))
-def test_cameras_look_at_the_target_from_their_ring(preset):
+@pytest.mark.parametrize(("preset", "target"), [("ring", [0.5, 0.0, 0.0]), ("paper", [0.25, 0.0, 0.0])])
+def test_cameras_look_at_the_target_from_their_ring(preset, target):
     camera = scenes.cameras(preset)
-    target = {"ring": [0.5, 0.0, 0.0], "paper": [0.25, 0.0, 0.0]}[preset]
     eye = np.asarray(camera.world_from_cam)[:, :3, 3] - target
     np.testing.assert_allclose(np.hypot(eye[:, 0], eye[:, 1]), 0.75, atol=1e-6)
     np.testing.assert_allclose(eye[:, 2], 0.75)

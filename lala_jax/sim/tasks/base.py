@@ -42,6 +42,7 @@ def closest(colors: np.ndarray) -> float:
 
 
 APART = closest(palette("paper"))  # colours drawn uniformly are at least so far from each other
+LOWEST = 0.02  # metres, of objects: twice what the score tolerates in height
 BURIED = -1.0  # metres, the height of a distractor's goal: under the table, where no camera sees it
 
 WORKSPACE = types.MapSpec()
@@ -137,7 +138,7 @@ class Task:
 
     num_objects: int  # that the goal shows
     colors: str = "paper"  # one of COLOR_CHOICES
-    max_actions: int | None = None  # None: the task's own budget
+    max_actions: int | None = None  # of an episode; None: the task's own budget
     distractors: int = 0
 
     name: ClassVar[str]
@@ -150,10 +151,13 @@ class Task:
         most = len(PALETTES.get(self.colors, COLORS)) - self.num_objects
         if self.distractors and not 0 < self.distractors <= most:
             raise ValueError(f"task {self.name}: distractors={self.distractors} is not one of 0..{most}: each has a colour of its own")
-        budget = self.default_max_actions() if self.max_actions is None else self.max_actions
-        if budget < 1:
-            raise ValueError(f"task {self.name}: max_actions={budget} must be at least 1")
-        object.__setattr__(self, "max_actions", budget)
+        if self.budget < 1:
+            raise ValueError(f"task {self.name}: max_actions={self.budget} must be at least 1")
+
+    @property
+    def budget(self) -> int:
+        """The actions that an episode may take."""
+        return self.default_max_actions() if self.max_actions is None else self.max_actions
 
     def default_max_actions(self) -> int:
         """Give the action budget that the benchmark grants."""
@@ -183,7 +187,20 @@ class Task:
         scene = self.build(rng)
         if self.distractors:  # after all else: the other objects stay what they are without
             scene = self._with_distractors(rng, scene)
-        return types.Scene(**{field.name: np.asarray(getattr(scene, field.name), np.float32) for field in dataclasses.fields(scene)})
+        drawn = types.Scene(**{field.name: np.asarray(getattr(scene, field.name), np.float32) for field in dataclasses.fields(scene)})
+        self._check(drawn)
+        return drawn
+
+    def _check(self, scene: types.Scene) -> None:
+        """Raise ValueError, naming the field, for a scene that nothing later could make sense of."""
+        count = self.num_objects + self.distractors
+        shapes = {"size": (count, 3), "color": (count, 3), "base": (7,), "start": (count, 7), "goal": (count, 7), "symmetry": (count,)}
+        for name, shape in shapes.items():
+            if (found := getattr(scene, name)).shape != shape or not np.isfinite(found).all():
+                found = found if found.shape == shape else found.shape
+                raise ValueError(f"task {self.name}: a scene's {name} must be finite and of shape {shape}, got {found}")
+        if (lowest := scene.size[:, 2].min()) < LOWEST - 1e-6:
+            raise ValueError(f"task {self.name}: objects must be at least {LOWEST} m high, or the score mixes up levels, got {lowest:.4f}")
 
     def _with_distractors(self, rng: np.random.Generator, scene: types.Scene) -> types.Scene:
         """Add the distractors, clear of all that lies on the table."""
