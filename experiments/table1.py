@@ -162,6 +162,7 @@ def main(
     launcher: str, launcher_options: str,
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Train and score every row of the table at a scale, and write the table and the bars."""
+    options.check_choice("--task", task, PUBLISHED)
     common.check_task(config, task)
     launch = cluster.launcher(launcher, launcher_options)
     options.check_choice("--scale", scale, SCALES)

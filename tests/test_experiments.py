@@ -378,6 +378,11 @@ def test_the_checkpoint_of_another_run_is_not_taken_for_the_first_rows(tmp_path)
         common.check_run(str(tmp_path), options.override(config, ["seed=4"]))
 
 
+def test_the_table_is_of_the_papers_tasks():
+    with pytest.raises(options.OptionsError, match="--task must be one of 'tower', 'pallet', got 'mine'"):
+        table1.main(shipped("tower"), "nowhere", **{**table1.FLAGS, "task": "mine"})
+
+
 def test_bars_are_as_long_as_the_scores(tmp_path):
     def drawn(*scores):
         rows = [{"score": score, "interval95": [None, None], "published": None} for score in scores]
