@@ -1,0 +1,78 @@
+"""The README: its examples run, its scores are those of the files, and what it names is there."""
+
+import contextlib
+import io
+import json
+import pathlib
+import re
+
+import pytest
+
+from experiments import common
+from lala_jax import defaults, options
+
+ROOT = pathlib.Path(__file__).resolve().parent.parent
+RESULTS = ROOT / "experiments" / "results"
+TEXT = (ROOT / "README.md").read_text()
+FIELDS = options.fields(options.to_dict(defaults.get("", task="tower")))
+
+
+def section(title):
+    """The text under a heading of the second level."""
+    return re.split(r"^## .*$", TEXT.partition(f"\n## {title}\n")[2], maxsplit=1, flags=re.M)[0]
+
+
+def test_the_notebook_builds_a_tower():
+    """The cells one after another, as a user pastes them: the last one prints the score."""
+    cells, names, said = re.findall(r"```python\n(.*?)```", section("In a notebook"), re.S), {}, io.StringIO()
+    assert len(cells) == 3
+    with contextlib.redirect_stdout(said):
+        for cell in cells:
+            exec(cell, names)
+    assert said.getvalue() == "100.0\n"
+    assert names["seen"].features.shape == (320, 160, 14, 3) and names["views"].depth.shape == (4, 240, 320)
+    assert names["heatmaps"].pick.shape == (160, 80) and names["heatmaps"].place.shape == (36, 160, 80)
+
+
+FILES = [f"{task}/{name}.json" for task in ("tower", "pallet") for name in ("main", "robustness-test")] + ["ablation/ablation-pallet.json"]
+FILES += [f"{task}/scores-{agent}-test.json" for task in ("tower", "pallet") for agent in ("policy", "oracle", "top_view", "blind")]
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_scores_are_those_of_the_files(file):
+    found = json.loads((RESULTS / file).read_text())
+    text = section("Results").replace("*", "")
+    for row in found.get("rows", [found]):
+        assert f"{common.with_interval(row['score'], row['interval95'])} |" in text
+
+
+def test_the_table_of_rivals_is_the_one_that_was_written():
+    assert (RESULTS / "table1" / "cpu.md").read_text().strip() in section("Results")
+
+
+def test_links_lead_somewhere():
+    links = [link for link in re.findall(r"\]\(([^)]+)\)", TEXT) if not link.startswith("http")]
+    assert len(links) > 10 and not [link for link in links if not (ROOT / link).exists()]
+
+
+@pytest.mark.parametrize("form", [r"--config\.([a-z_]+\.[a-z_]+)=", r"`((?:augment|camera|data|eval|map|model|optim|train)\.[a-z_]+)[`=]"])
+def test_fields_of_the_config_are_there(form):
+    named = set(re.findall(form, TEXT))
+    assert len(named) > 10 and named <= FIELDS.keys()
+
+
+def test_the_layout_names_every_module():
+    there = [path for part in ("lala_jax", "experiments") for path in (ROOT / part).rglob("*.py") if path.name != "__init__.py"]
+    named = set(re.findall(r"[a-z0-9_*]+\.py", section("Layout")))
+    kinds = {name.replace("*", "") for name in named if "*" in name}  # such as benchmark_*.py
+    assert not [path for path in there if path.name not in named and not any(path.stem.startswith(kind[:-3]) for kind in kinds)]
+
+
+def test_the_layout_names_no_other_module():
+    there = {path.name for path in ROOT.rglob("*.py")}
+    assert {name for name in re.findall(r"[a-z0-9_*]+\.py", section("Layout")) if "*" not in name} <= there
+
+
+def test_tests_that_laws_name_are_there():
+    named = re.findall(r"`((?:[a-z]+/)?test_[a-z_]+\.py)`", section("Laws and where they are tested"))
+    assert len(named) > 15 and not [name for name in named if not (ROOT / "tests" / name).exists()]
