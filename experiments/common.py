@@ -140,13 +140,15 @@ def fill(
     weights: Mapping[str, Any] | None = None,
     launch: cluster.Launcher | None = None,
     before: Sequence[Before] = (),
+    known: Sequence[Row] = (),
 ) -> list[dict[str, Any]]:
     """Give the fields of all `rows`; those that are not in the file are run, and each is added to what the file holds by then.
 
     A row of the file with a row's name and another `identity` is run again and replaced, other rows stay. `finish(done, kept)` may
     add to the rows that are `done`, in the order of `rows`, and gives the file's other fields; `kept` are all rows of the file that
-    belong to the same config, seeds and weights, also those not asked for. With `launch` the rows are run by workers, after what they
-    share, `before`; where some are missing in the end, the file holds the others, and SystemExit is raised.
+    belong to the same config, seeds and weights, also those not asked for, but for old revisions of `known` rows. With `launch` the
+    rows are run by workers, after what they share, `before`; where some are missing in the end, the file holds the others, and
+    SystemExit is raised.
     """
     stored = read(path)
     order = [*stored, *(row.name for row in rows)]
@@ -158,11 +160,16 @@ def fill(
         finished = [done[one.name] for one in rows if one.name in done]
         with cluster.exclusive(path):
             stored = read(path) | done  # another command may have written to it
-            kept = [one for one in stored.values() if belongs(one, config, seeds, weights)]
+            kept = [one for one in stored.values() if belongs(one, config, seeds, weights) and not _is_old(one, known)]
             fields = finish(finished, kept)
             ordered = [stored[name] for name in dict.fromkeys([*order, *stored]) if name in stored]
             writers.write_json(path, {**fields, "rows": ordered})
     return [done[row.name] for row in rows]
+
+
+def _is_old(stored: Mapping[str, Any], known: Sequence[Row]) -> bool:
+    """Say whether a stored row is of another revision than the known one of its name."""
+    return any(row.name == stored["name"] and row.revision != stored.get("revision", 0) for row in known)
 
 
 def read(path: pathlib.Path) -> dict[str, dict[str, Any]]:

@@ -68,7 +68,7 @@ def main(
     path = pathlib.Path(out or f"experiments/results/{name}") / f"robustness-{split}.json"
     loaded = params if launch is None else None
     work = functools.partial(run, base=config, checkpoint=checkpoint, weights=weights, seeds=seeds, params=loaded)
-    done = common.fill(path, chosen, work, finish, config=config, seeds=seeds, weights=weights, launch=launch)
+    done = common.fill(path, chosen, work, finish, config=config, seeds=seeds, weights=weights, launch=launch, known=ROWS)
     print(f"\n{table(done)}\n\n{path}")
     return done
 

@@ -192,6 +192,19 @@ def test_a_row_whose_code_changed_runs_again_in_a_directory_of_its_own(tmp_path)
     assert old.folder == "a" and new.folder == "a-r2"
 
 
+def test_an_old_revision_of_a_row_that_is_not_asked_for_does_not_count(tmp_path):
+    path, config, counted = tmp_path / "rows.json", tiny_config(), []
+
+    def finish(done, kept):
+        counted.append([row["name"] for row in kept])
+        return {}
+
+    for rows, known in ((("a", "b"), ()), (("a",), [common.Row("b", "b")]), (("a",), [common.Row("b", "b", revision=1)])):
+        asked = [common.Row(name, name) for name in rows]
+        common.fill(path, asked, lambda row: {"score": 50.0}, finish, config=config, seeds=SEEDS, known=known)
+    assert counted[-2:] == [["a", "b"], ["a"]] and len(common.read(path)) == 2
+
+
 def test_two_commands_write_to_one_file(tmp_path):
     """What another one added while a row ran stays."""
     path, config = tmp_path / "rows.json", tiny_config()
