@@ -14,6 +14,7 @@ from flax import struct
 
 from lala_jax import backbone, types
 from lala_jax.perception import batches, calibration, noise, topdown
+from lala_jax.perception import camera as cameras
 from lala_jax.sim import distance, render, scene
 from lala_jax.sim.tasks import base
 
@@ -151,17 +152,19 @@ class Observer:
 
     def check(self) -> None:
         """Raise ValueError naming the first camera of the preset that sees nothing, or nothing of the map's area."""
-        layer, camera, spec = self.background(), self.camera, self.spec
+        layer = self.background()
         render.check_views(layer)
-        u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-        leaves = (np.asarray(leaf) for leaf in (layer.depth, camera.intrinsics, camera.world_from_cam))
-        for number, (depth, intrinsics, pose) in enumerate(zip(*leaves, strict=True)):
-            rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(intrinsics).T
-            x, y, _ = np.moveaxis((rays * depth[..., None]) @ pose[:3, :3].T + pose[:3, 3], -1, 0)
-            share = ((depth > 0) & (x >= spec.x[0]) & (x < spec.x[1]) & (y >= spec.y[0]) & (y < spec.y[1])).mean()
+        for number, share in enumerate(np.asarray(_share_of_map(layer.depth, self.camera, self.spec))):
             if share < SEEN:
-                seen = f"the map's area, x {spec.x} and y {spec.y}, in {share:.2%} of its pixels, not {SEEN:.0%}"
+                seen = f"the map's area, x {self.spec.x} and y {self.spec.y}, in {share:.2%} of its pixels, not {SEEN:.0%}"
                 raise ValueError(f"camera {number} sees {seen}: where does it look?")
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def _share_of_map(depth: jax.Array, camera: types.Camera, spec: types.MapSpec) -> jax.Array:
+    """Give the share `[V]` of the pixels of `depth` `[V, H, W]` that show something over or under the map's cells."""
+    points = jax.vmap(cameras.unproject)(depth, camera)
+    return ((depth > 0) & types.in_map(spec, types.index_from_world(spec, points[..., :2]))).mean((1, 2))
 
 
 _load = functools.lru_cache(maxsize=2)(lambda name, stage, dtype: backbone.load(name, stage=stage, dtype=jnp.dtype(dtype)))
