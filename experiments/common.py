@@ -272,22 +272,12 @@ def difference(scores: Mapping[str, float], reference: Mapping[str, float], *, p
     if paired:
         if scores.keys() != reference.keys():
             raise ValueError(f"paired scores need the same seeds, got {len(scores)} and {len(reference)} of them, or others")
-        down, up = _reach([value - reference[seed] for seed, value in scores.items()], -100.0)
+        down, up = rollout.reach([value - reference[seed] for seed, value in scores.items()], lowest=-100.0)
     else:
-        (down, up), (other_down, other_up) = (_reach(list(one.values()), 0.0) for one in (scores, reference))
+        (down, up), (other_down, other_up) = (rollout.reach(list(one.values())) for one in (scores, reference))
         down, up = math.hypot(down, other_up), math.hypot(up, other_down)  # Newcombe (1998), method 10
     mean = float(np.mean(list(scores.values())) - np.mean(list(reference.values())))
     return {"mean": mean, "interval95": [mean - down, mean + up], "paired": paired}
-
-
-def _reach(values: Sequence[float], lowest: float) -> tuple[float, float]:
-    """Say how far the interval of the mean of values from `lowest` to 100 reaches down and up; as `rollout.interval`, without the cut."""
-    if len(values) > 1 and np.ptp(values) == 0.0:
-        scale = (100.0 - lowest) / 100.0
-        low, high = rollout.interval([(value - lowest) / scale for value in values])
-        at = (values[0] - lowest) / scale
-        return scale * (at - low), scale * (high - at)
-    return (half := rollout.half_width(values)), half
 
 
 # Tables

@@ -142,23 +142,26 @@ def erring_agent(task: base.Task, scenes: Sequence[types.Scene], seeds: Sequence
     return agent
 
 
-def half_width(values: Sequence[float] | np.ndarray) -> float:
-    """Give half the width of the normal 95% interval of the mean of `values`, NaN for fewer than two."""
-    return 1.96 * float(np.std(values, ddof=1)) / math.sqrt(len(values)) if len(values) > 1 else math.nan
+def reach(values: Sequence[float] | np.ndarray, *, lowest: float = 0.0) -> tuple[float, float]:
+    """Say how far the 95% interval of the mean of values from `lowest` to 100 reaches down and up: the normal one, NaNs for fewer than two.
+
+    Where all `n` values are the same `c`, whose normal interval has no width, those means are left out under which that has a chance of
+    less than 2.5%. With `lowest` 0, values of mean `m` are `c` with a probability of at most `m / c`, and `(100 - m) / (100 - c)` (Markov's
+    inequality), so the ends are `c a` and `100 - (100 - c) a`, with `a = 0.025 ** (1 / n)`: Clopper and Pearson's (1934) for 0 or 100.
+    """
+    if len(values) < 2:
+        return math.nan, math.nan
+    if np.ptp(values) == 0.0:
+        far = 1.0 - 0.025 ** (1 / len(values))
+        return (values[0] - lowest) * far, (100.0 - values[0]) * far
+    half = 1.96 * float(np.std(values, ddof=1)) / math.sqrt(len(values))
+    return half, half
 
 
 def interval(scores: Sequence[float] | np.ndarray) -> list[float]:
-    """Give the 95% interval of the mean of scores between 0 and 100: the normal one, NaNs for fewer than two.
-
-    Where all `n` scores are the same `c`, whose normal interval has no width, those means are left out under which that has a chance of
-    less than 2.5%. Scores of mean `m` are `c` with a probability of at most `m / c`, and `(100 - m) / (100 - c)` (Markov's inequality), so
-    the ends are `c a` and `100 - (100 - c) a`, with `a = 0.025 ** (1 / n)`: Clopper and Pearson's (1934) for `c` of 0 or 100.
-    """
-    mean, half = float(np.mean(scores)), half_width(scores)
-    if len(scores) > 1 and np.ptp(scores) == 0.0:
-        share = 0.025 ** (1 / len(scores))
-        return [mean * share, 100.0 - (100.0 - mean) * share]
-    return [max(mean - half, 0.0), min(mean + half, 100.0)]
+    """Give the 95% interval of the mean of scores between 0 and 100: what `reach` says, cut at both."""
+    mean, (down, up) = float(np.mean(scores)), reach(scores)
+    return [max(mean - down, 0.0), min(mean + up, 100.0)]
 
 
 def head(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
