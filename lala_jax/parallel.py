@@ -41,10 +41,11 @@ def launched(environ: Mapping[str, str]) -> dict[str, Any] | None:
     The variables of EXPLICIT come first, then a Slurm step, Open MPI, and a pod of an Indexed Job where the package `kubernetes` is
     installed; what is not told JAX finds out itself. Raises OptionsError where a variable of EXPLICIT is missing or no number.
     """
+    incomplete = options.OptionsError(f"the environment sets some, but not all of {', '.join(EXPLICIT)}")
     address, *numbers = (environ.get(name) for name in EXPLICIT)
     if numbers != [None, None]:
         if None in (address, *numbers):
-            raise options.OptionsError(f"the environment sets some, but not all of {', '.join(EXPLICIT)}")
+            raise incomplete
         count, process = (_number(environ, name) for name in EXPLICIT[1:])
         if not 0 <= process < count:
             raise options.OptionsError(f"JAX_PROCESS_ID must be from 0 to JAX_NUM_PROCESSES - 1 = {count - 1}, got {process}")
@@ -58,7 +59,7 @@ def launched(environ: Mapping[str, str]) -> dict[str, Any] | None:
         if indexed and importlib.util.find_spec("kubernetes"):
             return {}
         if address is not None:  # what a scheduler would tell is missing
-            raise options.OptionsError(f"the environment sets some, but not all of {', '.join(EXPLICIT)}")
+            raise incomplete
         return None
     return {"num_processes": count} if count > 1 else None
 

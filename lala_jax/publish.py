@@ -63,7 +63,7 @@ def publish(
     if len(arrays) > LARGEST:
         hint = "; try --dtype=bfloat16" if dtype == "float32" else ""
         raise checkpoint.CheckpointError(f"{source} makes {len(arrays):,} bytes, published weights have at most {LARGEST:,}{hint}")
-    rows, settings = _score_rows(score_files, source, config)
+    rows, settings = _score_rows(score_files, source, params, config)
     card = {
         "version": pretrained.FORMAT_VERSION,
         "name": out.name,
@@ -76,7 +76,7 @@ def publish(
         "training": {"seed": config["seed"], "steps": config["train"]["steps"], "selection": _selection(config)},
         "commands": {"train": training_command(config), "evaluate": _evaluation_command(out)},
         "scores": rows,
-        "robustness": _robustness(robustness, config["task"]["name"], source) if robustness else None,
+        "robustness": _robustness(robustness, config["task"]["name"], source, params) if robustness else None,
         "input_spec": input_spec,
         "config": {**config, "eval": settings},
     }
@@ -98,13 +98,13 @@ def _read_json(path: str) -> Any:
         raise options.OptionsError(f"cannot read {path}: {error}") from error
 
 
-def _score_rows(files: Sequence[str], source: str, config: Mapping[str, Any]) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """Read score files of `source`: the card's rows, and the config's `eval` group that repeats the first."""
+def _score_rows(files: Sequence[str], source: str, params: Any, config: Mapping[str, Any]) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Read score files of `source`, which holds `params`: the card's rows, and the config's `eval` group that repeats the first."""
     rows, settings = [], []
     for file in files:
         found = _read_json(file)
         try:
-            if found["agent"] != "policy" or not _same_weights(found, source):
+            if found["agent"] != "policy" or not _same_weights(found, source, params):
                 raise options.OptionsError(f"{file} holds scores of {_scored(found)}, not of {source}")
             changed = pretrained.differences(found["config"], config)
             if changed:
@@ -123,20 +123,20 @@ def _scored(found: Mapping[str, Any]) -> str:
     return f"{found['checkpoint']}{held}" if found["checkpoint"] is not None else found["agent"]
 
 
-def _same_weights(found: Mapping[str, Any], source: str) -> bool:
-    """Say whether a file of scores is of the parameters at `source`.
+def _same_weights(found: Mapping[str, Any], source: str, params: Any) -> bool:
+    """Say whether a file of scores is of the parameters `params` at `source`.
 
     By the fingerprint it holds; an older file by the checkpoint it names: the same place, or equal in every leaf.
     """
     if found.get("weights") is not None:
-        return found["weights"] == pretrained.fingerprint(source, pretrained.load(source)[0])
-    one, other = found["checkpoint"], source
+        return found["weights"] == pretrained.fingerprint(source, params)
+    one = found["checkpoint"]
     if one is None:
         return False
-    if os.path.abspath(pretrained.find(one)) == os.path.abspath(pretrained.find(other)):
+    if os.path.abspath(pretrained.find(one)) == os.path.abspath(pretrained.find(source)):
         return True
     try:
-        there, here = (checkpoint.named(pretrained.load(path)[0]) for path in (one, other))
+        there, here = checkpoint.named(pretrained.load(one)[0]), checkpoint.named(params)
     except checkpoint.CheckpointError:  # no longer there: nothing says that it was the same
         return False
     return there.keys() == here.keys() and all(np.array_equal(there[name], here[name]) for name in there)
@@ -187,11 +187,11 @@ def _evaluation_command(out: pathlib.Path) -> str:
     return f"python -m lala_jax.evaluate --checkpoint={shlex.quote(place)}"
 
 
-def _robustness(file: str, task: str, source: str) -> dict[str, Any]:
+def _robustness(file: str, task: str, source: str, params: Any) -> dict[str, Any]:
     """Read the scores in other worlds that `experiments.robustness` writes."""
     found = _read_json(file)
     try:
-        if found["task"] != task or not _same_weights(found, source):
+        if found["task"] != task or not _same_weights(found, source, params):
             raise options.OptionsError(f"{file} holds scores of {found['task']}, {_scored(found)}, not of {task}, {source}")
         rows = [{"condition": name, **_row(row, (), file)} for name, row in found["conditions"].items()]
         return {"file": file, "split": found["split"], "conditions": rows}
