@@ -32,11 +32,7 @@ def draw_states(config: Mapping[str, Any]) -> types.State:
     Each scene gives its start, its goal and all between. Seeds whose scene has no free pose are passed over.
     """
     task, found = build.task(config), []
-    for seed in build.split_seeds("train", 0, config["pretrain"]["scenes"]):
-        try:
-            scene = task.sample(seed)
-        except base.NoFreePose:
-            continue
+    for seed, scene in task.roomy(build.split_seeds("train", 0, config["pretrain"]["scenes"])):
         rng, poses = np.random.default_rng(seed), scene.start.copy()
         while True:
             ready = oracle.ready(task, scene, poses)

@@ -66,10 +66,13 @@ def _why(config, seeds: list[int]) -> str:
     """Say how the oracle fails on scenes of which it solves none."""
     task = build.task(config)
     text = f"the oracle solves none of the first {HOPE} scenes of task {task.name}"
+    episodes = _attempt(task, seeds, threads=config["data"]["threads"], mistakes=build.mistakes(config))
     try:
-        result = rollout.summary(_attempt(task, seeds, threads=config["data"]["threads"], mistakes=build.mistakes(config)))
+        if not episodes:
+            task.sample(seeds[0])  # says where there is no room
     except base.NoFreePose as error:
         return f"{text}: {error}"
+    result = rollout.summary(episodes)
     counts = {name: count for field in ("actions_by_cause", "failures_by_reason") for name, count in result[field].items() if count}
     told = ", ".join(f"{name} {count}" for name, count in counts.items())
     return f"{text}: in {result['episodes']} of them it scores {result['score']:.0f}; its {result['actions']} actions were {told}"
@@ -126,25 +129,16 @@ def demonstrate(task: base.Task, seeds: list[int], *, threads: int, mistakes: fl
 
     Seeds whose scene has no free pose are passed over.
     """
-    try:
-        episodes = _attempt(task, seeds, threads=threads, mistakes=mistakes)
-    except base.NoFreePose:
-        return []
+    episodes = _attempt(task, seeds, threads=threads, mistakes=mistakes)
     return [episode.demo() for episode in episodes if episode.score > MIN_SCORE and np.isfinite(episode.poses).all()]
 
 
 def _attempt(task: base.Task, seeds: list[int], *, threads: int, mistakes: float) -> list[rollout.Episode]:
-    """Give the oracle's episodes in the scenes of `seeds` that have room for all objects; raises NoFreePose where none has."""
-    scenes, usable, crowded = [], [], None
-    for seed in seeds:
-        try:
-            scenes.append(task.sample(seed))
-        except base.NoFreePose as error:
-            crowded = error
-            continue
-        usable.append(seed)
-    if crowded is not None and not usable:
-        raise crowded
+    """Give the oracle's episodes in the scenes of `seeds` that have room for all objects."""
+    pairs = list(task.roomy(seeds))
+    if not pairs:
+        return []
+    usable, scenes = map(list, zip(*pairs, strict=True))
     agent = rollout.erring_agent(task, scenes, usable, share=mistakes)
     budget = math.ceil(task.budget * (1.0 + PATIENCE * mistakes))
     return rollout.run(task, scenes, usable, agent, threads=threads, max_actions=budget)

@@ -146,11 +146,8 @@ def static_geoms(model: mujoco.MjModel | mjx.Model) -> tuple[int, ...]:
 
 def _any_scene(task: base.Task) -> types.Scene:
     """Give the first scene of a task that has room for its objects."""
-    for seed in range(TRIES):
-        try:
-            return task.sample(seed)
-        except base.NoFreePose:
-            continue
+    for _, drawn in task.roomy(range(TRIES)):
+        return drawn
     raise base.NoFreePose(f"task {task.name}: none of the first {TRIES} scenes has a free pose for every object")
 
 

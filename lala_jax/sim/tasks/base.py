@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import zlib
+from collections.abc import Iterable, Iterator
 from typing import ClassVar
 
 import numpy as np
@@ -190,6 +191,15 @@ class Task:
         drawn = types.Scene(**{field.name: np.asarray(getattr(scene, field.name), np.float32) for field in dataclasses.fields(scene)})
         self._check(drawn)
         return drawn
+
+    def roomy(self, seeds: Iterable[int]) -> Iterator[tuple[int, types.Scene]]:
+        """Give `(seed, scene)` of the seeds whose scene has a free pose for every object; the others are passed over."""
+        for seed in seeds:
+            try:
+                scene = self.sample(seed)
+            except NoFreePose:
+                continue
+            yield seed, scene
 
     def _check(self, scene: types.Scene) -> None:
         """Raise ValueError, naming the field, for a scene that nothing later could make sense of."""
