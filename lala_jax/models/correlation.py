@@ -85,7 +85,7 @@ def _spectral_bwd(chunk, kept, slopes):
 
     parts = _chunks(kernels, chunk), _chunks(slopes, chunk)
     total, by_kernel = jax.lax.scan(some, jnp.zeros_like(spectrum), parts)
-    by_key = jnp.fft.irfft2(total, s=(height, width))[:, before : before + rows, before : before + cols]
+    by_key = _irfft2(total, width, before + rows, before + cols)[:, before:, before:]
     return by_key, _joined(by_kernel, len(kernels))
 
 
@@ -100,8 +100,7 @@ def _key_spectrum(key, size):
     """
     before, after = _reach(size)
     lengths = tuple(_fast_length(side + max(before, after)) for side in key.shape[1:])
-    rims = ((before, length - before - side) for side, length in zip(key.shape[1:], lengths, strict=True))
-    return jnp.fft.rfft2(jnp.pad(key, ((0, 0), *rims))), lengths, before
+    return _rfft2(jnp.pad(key, ((0, 0), (before, 0), (before, 0))), *lengths), lengths, before
 
 
 def _chunks(values, chunk):
@@ -115,14 +114,18 @@ def _joined(parts, count):
     return parts.reshape(-1, *parts.shape[2:])[:count]
 
 
+# Spectra lie `[..., width // 2 + 1, height]`, columns along the rows of memory, as their transform leaves them: XLA transforms along
+# the last axis only. Taken in turn by hand, the correlation and its gradient take 0.87 of what they do with spectra turned back each time.
+
+
+def _rfft2(values: jax.Array, height: int, width: int) -> jax.Array:
+    """Transform `[..., rows, cols]` zero-padded to `[..., height, width]`; rows of zeros are added after their transform."""
+    return jnp.fft.fft(jnp.swapaxes(jnp.fft.rfft(values, n=width), -1, -2), n=height)
+
+
 def _irfft2(spectrum: jax.Array, width: int, rows: int, cols: int) -> jax.Array:
     """Give the first `rows` and `cols` of the inverse transform, without transforming the other rows back."""
-    return jnp.fft.irfft(jnp.fft.ifft(spectrum, axis=-2)[..., :rows, :], n=width, axis=-1)[..., :cols]
-
-
-def _rfft2(kernels: jax.Array, height: int, width: int) -> jax.Array:
-    """Transform `[..., c, c]` zero-padded to `[..., height, width]`; rows of zeros are added after their transform."""
-    return jnp.fft.fft(jnp.fft.rfft(kernels, n=width, axis=-1), n=height, axis=-2)
+    return jnp.fft.irfft(jnp.swapaxes(jnp.fft.ifft(spectrum)[..., :rows], -1, -2), n=width)[..., :cols]
 
 
 def _reach(size: int) -> tuple[int, int]:
