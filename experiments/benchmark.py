@@ -2,8 +2,9 @@
 
 Times the stages of `benchmark_stages` at the sizes of `configs/<task>.py`, and with `--growth=true` how some grow with a size; a matrix
 product and a copy of the same run say how much of the machine's own rate a stage reaches, and `benchmark_targets` what it must show.
-Writes `<device>-<task>.json` to `--out` and prints its tables. `--stages=render,fuse` times only these (and the two ceilings); as ratios
-are of one run, it is refused where it would replace a file that holds other stages, too.
+Writes `<device>-<task>.json` to `--out` and prints its tables; until all is timed, what there is lies in `<device>-<task>.part.json`.
+`--stages=render,fuse` times only these (and the two ceilings); as ratios are of one run, it is refused where it would replace a file
+that holds other stages, too.
 `--against=FILE` compares with an earlier file by ratios of medians, and ends with status 1 where a stage takes more than `--limit`
 times as long or fails. Comparisons that need what is not installed (PyTorch: extra `benchmark`; OpenGL: Debian's libegl1 and
 libgl1-mesa-dri) are left out, and the table says so.
@@ -56,23 +57,36 @@ def main(config, workdir, *, task: str, stages: str, growth: bool, repeats: int,
         if held.get("growth") and not growth:
             raise options.OptionsError(f"{path} holds how cost grows, which this leaves out: give --growth=true or another --out")
     apart = jax.default_backend() == "cpu"  # a GPU's memory is this process's
-    rows = []
+    rows, grown = [], []
+
+    def report() -> dict[str, Any]:
+        return {"task": task, **here, **judged(rows, task), "growth": grown}
+
+    part = path.with_suffix(".part.json")
     for name in (*ceilings, *wanted):
         print(f"{name}: {every[name].label}", flush=True)
         rows.append(timing.timed(name, every, config, repeats, apart=apart))
         print(f"  {cost(rows[-1])}", flush=True)
-    peaks = {field: row[f"{field}_per_second"] for row in rows if (field := ceilings.get(row["name"])) and f"{field}_per_second" in row}
-    for row in rows:
-        row["share"] = {field: row[f"{field}_per_second"] / peak for field, peak in peaks.items() if f"{field}_per_second" in row}
-    grown = [benchmark_stages.grow(name, config, repeats, apart=apart) for name in benchmark_stages.GROWTH] if growth else []
-    targets = [benchmark_targets.judged(target, rows, task, jax.default_backend()) for target in benchmark_targets.TARGETS]
-    result = {"task": task, **here, "stages": rows, "growth": grown, "targets": targets}
-    writers.write_json(path, result)
-    parts = [table(rows), *([growth_table(grown)] if grown else []), benchmark_targets.table(targets), str(path)]
+        writers.write_json(part, report())
+    for name in benchmark_stages.GROWTH if growth else ():
+        grown.append(benchmark_stages.grow(name, config, repeats, apart=apart))
+        writers.write_json(part, report())
+    part.replace(path)
+    result = report()
+    parts = [table(result["stages"]), *([growth_table(grown)] if grown else []), benchmark_targets.table(result["targets"]), str(path)]
     print("".join(f"\n{part}\n" for part in parts))
     if before is not None and slower(before, result, limit):
         raise SystemExit(1)
     return result
+
+
+def judged(rows: Sequence[Mapping[str, Any]], task: str) -> dict[str, Any]:
+    """Give the stages with their shares of the ceilings among them, and what they show of the targets."""
+    ceilings = benchmark_stages.CEILINGS
+    peaks = {field: row[f"{field}_per_second"] for row in rows if (field := ceilings.get(row["name"])) and f"{field}_per_second" in row}
+    shares = [{field: row[f"{field}_per_second"] / peak for field, peak in peaks.items() if f"{field}_per_second" in row} for row in rows]
+    targets = [benchmark_targets.judged(target, rows, task, jax.default_backend()) for target in benchmark_targets.TARGETS]
+    return {"stages": [{**row, "share": share} for row, share in zip(rows, shares, strict=True)], "targets": targets}
 
 
 def machine() -> dict[str, Any]:

@@ -254,6 +254,8 @@ def test_two_files_are_compared_by_ratio(monkeypatch, tmp_path, capsys):
     def timed(name, stages, config, repeats, *, apart):
         assert apart == (jax.default_backend() == "cpu")
         row = {"name": name, "label": stages[name].label, "unit": stages[name].unit, "runs": repeats, "recompiled": 0}
+        if name == "b" and taken["b"] == "stopped":
+            raise KeyboardInterrupt
         if name == "b" and taken["b"] in (None, "broken"):
             return {**row, "unavailable": "no b here"} | ({"failed": True} if taken["b"] else {})
         seconds = taken.get(name, 1.0)
@@ -296,6 +298,13 @@ def test_two_files_are_compared_by_ratio(monkeypatch, tmp_path, capsys):
     with pytest.raises(SystemExit, match="1"):
         benchmark.command(["--task=tower", f"--out={tmp_path}", f"--against={earlier}"])
     assert "b no longer runs: no b here" in capsys.readouterr().out
+    whole, taken["b"] = path.read_bytes(), "stopped"
+    with pytest.raises(KeyboardInterrupt):
+        benchmark.command(["--task=tower", f"--out={tmp_path}"])
+    part = path.with_suffix(".part.json")
+    assert path.read_bytes() == whole and [row["name"] for row in json.loads(part.read_text())["stages"]] == [*ceilings, "a"]
+    taken["b"] = 1.0
+    assert benchmark.command(["--task=tower", f"--out={tmp_path}"]) == json.loads(path.read_text()) and not part.exists()
     path.write_text(json.dumps({**stored, "growth": [{"name": "views"}]}))
     with pytest.raises(SystemExit, match="2"):
         benchmark.command(["--task=tower", f"--out={tmp_path}"])
