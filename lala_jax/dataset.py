@@ -40,7 +40,7 @@ class DatasetError(ValueError):
 def save(path: str | os.PathLike[str], demos: Sequence[types.Demo], *, task: str, task_options: Mapping[str, Any]) -> None:
     """Write a new dataset of `demos`.
 
-    Raises DatasetError where one exists already (see `append`) or a demonstration breaks the shapes of `types.Demo`.
+    Raises DatasetError where one exists already, and as `append` does.
     """
     path = pathlib.Path(path)
     if (path / "meta.json").exists() or _shards(path):
@@ -51,13 +51,16 @@ def save(path: str | os.PathLike[str], demos: Sequence[types.Demo], *, task: str
 def append(path: str | os.PathLike[str], demos: Sequence[types.Demo], *, task: str, task_options: Mapping[str, Any]) -> None:
     """Add `demos` as one shard, making the dataset if there is none: after a kill the shard is whole or absent. One writer per path.
 
-    Raises DatasetError for no demos, for broken shapes, or where `path` holds another task or other options.
+    `**build.data_identity(config)` gives the task and the options that training with a config asks for. Raises DatasetError for no demos,
+    for shapes or numbers that break `types.Demo`, another number of objects than the options' or the first's, or where `path` holds
+    another task or other options.
     """
     path = pathlib.Path(path)
     if not demos:
         raise DatasetError(f"no demonstrations to write to {path}")
+    wanted = task_options["num_objects"] + task_options.get("distractors", 0) if "num_objects" in task_options else None
     for index, demo in enumerate(demos):
-        _check_demo(demo, index)
+        _check_demo(demo, index, len(demos[0].scene.size) if wanted is None else wanted)
     meta = {"task": task, "task_options": writers.plain(task_options)}
     if (path / "meta.json").exists():
         _check_same(path, _read_meta(path), meta)
@@ -90,6 +93,8 @@ def load(
         raise DatasetError(f"count must be at least 1, got {count}")
     demos: list[types.Demo] = []
     for expected, shard in enumerate(_shards(path)):
+        if not shard.stem.removeprefix("shard-").isdigit():
+            raise DatasetError(f"{shard} is no shard that this code wrote: take it away")
         if shard.name != f"shard-{expected:06d}.demo":
             raise DatasetError(f"{path / f'shard-{expected:06d}.demo'} is missing: the next shard found is {shard.name}")
         if count is None or len(demos) < count:
@@ -145,8 +150,8 @@ def _demo(leaves: Mapping[str, np.ndarray]) -> types.Demo:
     return types.Demo(scene=scene, action=action, **{name: leaves[name] for name in _REST})
 
 
-def _check_demo(demo: types.Demo, index: int) -> None:
-    """Raise DatasetError naming the first leaf whose shape, kind or finiteness breaks `types.Demo`."""
+def _check_demo(demo: types.Demo, index: int, objects: int) -> None:
+    """Raise DatasetError naming the first leaf whose shape, kind or numbers break `types.Demo`, or another number of objects."""
     leaves = _leaves(demo)
     n, t = np.shape(demo.scene.size)[0], np.shape(demo.action.yaw)[0]
     shapes = {"size": (n, 3), "color": (n, 3), "base": (7,), "start": (n, 7), "goal": (n, 7), "symmetry": (n,)}
@@ -161,6 +166,10 @@ def _check_demo(demo: types.Demo, index: int) -> None:
             raise DatasetError(f"demonstration {index}: {name} is {leaf.dtype}, expected kind {kinds!r}")
         if kinds == "f" and not np.isfinite(leaf).all():
             raise DatasetError(f"demonstration {index}: {name} has values that are not finite")
+    if n != objects:
+        raise DatasetError(f"demonstration {index} has {n} objects, not {objects}: all of a dataset need as many")
+    if wrong := types.out_of_range(demo.scene) or types.no_unit_quat("poses", demo.poses):
+        raise DatasetError(f"demonstration {index}: {wrong}")
 
 
 def _shards(path: pathlib.Path) -> list[pathlib.Path]:

@@ -18,6 +18,7 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 
@@ -142,6 +143,28 @@ class Scene:
     start: jax.Array  # [N, 7] poses before the first action, world (box centres)
     goal: jax.Array  # [N, 7] poses in the goal picture, world
     symmetry: jax.Array  # [N] radians: turning the object by this about z changes nothing
+
+
+def out_of_range(scene: Scene) -> str:
+    """Say which numbers of a scene (numpy leaves, shapes as above) cannot be what their unit is; "" where all can."""
+    color, symmetry = np.asarray(scene.color), np.asarray(scene.symmetry)
+    if color.size and not (0.0 <= color.min() and color.max() <= 1.0):
+        return f"color must be RGB in 0..1, got {color.min():.4g} to {color.max():.4g}"
+    if symmetry.size and not (0.0 < symmetry.min() and symmetry.max() <= 2 * np.pi + 1e-5):
+        return f"symmetry must be radians above 0 and at most 2 pi, got {symmetry.min():.4g} to {symmetry.max():.4g}"
+    if (np.asarray(scene.size) <= 0.0).any():
+        return f"size must be metres above 0, got {np.min(scene.size):.4g}"
+    return next((text for name in ("base", "start", "goal") if (text := no_unit_quat(name, getattr(scene, name)))), "")
+
+
+def no_unit_quat(name: str, poses: np.ndarray) -> str:
+    """Say that poses `[..., 7]` hold quaternions that are not of length 1; "" where all are."""
+    norms = np.linalg.norm(np.asarray(poses, float)[..., 3:], axis=-1)
+    if norms.size and not np.allclose(norms, 1.0, atol=1e-3):
+        return (
+            f"{name} must hold x, y, z and a unit quaternion (w, x, y, z), got one of length {norms.flat[np.abs(norms - 1).argmax()]:.4g}"
+        )
+    return ""
 
 
 @struct.dataclass

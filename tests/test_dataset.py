@@ -17,14 +17,17 @@ def make_demo(seed, *, objects=3, actions=2):
     normal = rng.normal
     poses = normal(size=(actions + 1, objects, 7))
     poses.flat[0], poses.flat[1] = -0.0, np.nextafter(0, 1)
+    base, start, goal = normal(size=7), normal(size=(objects, 7)), normal(size=(objects, 7))
+    for pose in (poses, base, start, goal):
+        pose[..., 3:] /= np.linalg.norm(pose[..., 3:], axis=-1, keepdims=True)
     return types.Demo(
         scene=types.Scene(
-            size=normal(size=(objects, 3)).astype(np.float32),
-            color=normal(size=(objects, 3)),
-            base=normal(size=7),
-            start=normal(size=(objects, 7)),
-            goal=normal(size=(objects, 7)),
-            symmetry=normal(size=objects),
+            size=rng.random((objects, 3)).astype(np.float32),
+            color=rng.random((objects, 3)),
+            base=base,
+            start=start,
+            goal=goal,
+            symmetry=1 + rng.random(objects),
         ),
         poses=poses,
         action=types.PickPlace(pick=normal(size=(actions, 3)), place=normal(size=(actions, 3)), yaw=normal(size=actions)),
@@ -174,6 +177,9 @@ def test_a_kill_while_writing_leaves_whole_shards(path, monkeypatch):
     assert len(dataset.load(path)[0]) == 3
 
 
+SCENE = make_demo(1).scene
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -181,12 +187,27 @@ def test_a_kill_while_writing_leaves_whole_shards(path, monkeypatch):
         ({"placed": np.zeros((3, 3))}, "placed is float64"),
         ({"score": np.float32(np.nan)}, "score has values that are not finite"),
         ({"seed": np.float32(0)}, "seed is float32"),
+        ({"scene": SCENE.replace(color=255 * SCENE.color)}, r"demonstration 1: color must be RGB in 0..1, got .* to 1\d\d"),
+        ({"scene": SCENE.replace(symmetry=0 * SCENE.symmetry)}, "symmetry must be radians above 0 and at most 2 pi, got 0 to 0"),
+        ({"scene": SCENE.replace(size=-SCENE.size)}, "size must be metres above 0"),
+        ({"scene": SCENE.replace(goal=2 * SCENE.goal)}, "goal must hold x, y, z and a unit quaternion .*, got one of length 2"),
+        ({"poses": np.full((3, 3, 7), 0.1)}, "poses must hold x, y, z and a unit quaternion .*, got one of length 0.2"),
     ],
 )
 def test_broken_demos_are_not_written(tmp_path, change, message):
     with pytest.raises(dataset.DatasetError, match=message):
         dataset.save(tmp_path / "x", [make_demo(0), make_demo(1).replace(**change)], task="tower", task_options={})
+    with pytest.raises(dataset.DatasetError, match="demonstration 1 has 4 objects, not 3: all of a dataset need as many"):
+        dataset.save(tmp_path / "x", [make_demo(0), make_demo(1, objects=4)], task="tower", task_options={})
+    with pytest.raises(dataset.DatasetError, match="demonstration 0 has 3 objects, not 6"):
+        dataset.save(tmp_path / "x", [make_demo(0)], task="tower", task_options={"num_objects": 4, "distractors": 2})
     assert not (tmp_path / "x").exists()
+
+
+def test_a_file_that_nobody_wrote_is_named(path):
+    (path / "shard-000000 (1).demo").write_bytes((path / "shard-000000.demo").read_bytes())
+    with pytest.raises(dataset.DatasetError, match=r"shard-000000 \(1\).demo is no shard that this code wrote"):
+        dataset.load(path)
 
 
 def test_stack_equals_a_loop():

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Num
 
 from lala_jax import types
 from lala_jax.perception import camera as pinhole
@@ -27,7 +27,7 @@ NO_TURN = np.array([1.0, 0.0, 0.0, 0.0], np.float32)  # a quaternion
 
 
 def calibrate(
-    depth: Float[Array, "views height width"],
+    depth: Num[Array, "views height width"],
     camera: types.Camera,
     distance: Callable[[jax.Array], jax.Array],
     *,
@@ -35,7 +35,7 @@ def calibrate(
 ) -> types.Camera:
     """Give V cameras the poses from which they see what is known where it is; intrinsics stay. Each view on its own, no reference image.
 
-    `depth` is `[V, H, W]` in metres, 0 where nothing was seen, `camera` the nominal cameras (leaves `[V, ...]`), and
+    `depth` is `[V, H, W]` in metres, 0 (or not finite) where nothing was seen, `camera` the nominal cameras (leaves `[V, ...]`), and
     `distance` maps world points `[P, 3]` to their signed distances `[P]` in metres to the known surfaces, point by point and
     differentiable (`sim.distance`). The table is the plane z = 0 and must be one of them; anything else in the pictures is unknown.
 
@@ -57,6 +57,8 @@ def calibrate(
     size = (camera.intrinsics.shape[0], camera.height, camera.width)
     if depth.shape != size:
         raise ValueError(f"calibrate needs depth of its cameras' shape {size}, got {depth.shape}; vmap over scenes")
+    pinhole.check_floating(depth=(depth, "metres"))
+    depth = jnp.where(jnp.isfinite(depth) & (depth > 0), depth, 0.0)
 
     def one(depth, camera):
         shift, quat = _find(depth, camera, distance)

@@ -15,6 +15,13 @@ from lala_jax import types
 from lala_jax.perception import transforms
 
 
+def check_floating(**leaves: tuple[jax.Array, str]) -> None:
+    """Raise ValueError where pixels `name=(array, unit)` are whole numbers, of 0..255 or millimetres."""
+    for name, (leaf, unit) in leaves.items():
+        if not jnp.issubdtype(leaf.dtype, jnp.floating):
+            raise ValueError(f"{name} must be floating point, {unit}, got {leaf.dtype}")
+
+
 def intrinsics(height: int, width: int, *, focal: float) -> Float[Array, "3 3"]:
     """Give the matrix of a camera with square pixels and the principal point at the image's centre; `focal` in pixels."""
     return jnp.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]], jnp.float32)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import operator
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -81,12 +83,11 @@ def from_views(
 
     `views.rgb` is `[V, H, W, 3]` in 0..1 and `views.depth` `[V, H, W]` in metres along the camera's z, 0 where nothing was measured; the
     cameras' poses are in the frame of the map: the robot's base, x forward, z up, the table at z = 0. The margins are those of `fuse`.
-    Raises ValueError for whole numbers.
+    Raises ValueError for whole numbers and for shapes that do not fit. Of wrong units, inverted poses or OpenGL's camera axes it knows
+    nothing: the map is then empty (`count` is 0).
     """
-    for name, leaf in (("rgb", views.rgb), ("depth", views.depth)):
-        if not jnp.issubdtype(leaf.dtype, jnp.floating):  # of 0..255, or millimetres
-            unit = "in 0..1" if name == "rgb" else "metres"
-            raise ValueError(f"views.{name} must be floating point, {unit}, got {leaf.dtype}")
+    cameras.check_floating(**{"views.rgb": (views.rgb, "in 0..1"), "views.depth": (views.depth, "metres")})
+    check_shapes(views)
     points = jax.vmap(cameras.unproject)(views.depth, views.camera)
     values = views.rgb if features is None else jnp.concatenate([views.rgb, features], axis=-1)
     return fuse(
@@ -97,6 +98,16 @@ def from_views(
         floor_margin=floor_margin,
         surface_margin=surface_margin,
     )
+
+
+def check_shapes(views: types.Views) -> None:
+    """Raise ValueError, naming the field, where the leaves of V views do not fit each other."""
+    count, camera = len(views.depth), views.camera
+    shapes = {"depth": (count, camera.height, camera.width), "rgb": (count, camera.height, camera.width, 3)}
+    shapes |= {"camera.intrinsics": (count, 3, 3), "camera.world_from_cam": (count, 4, 4)}
+    for name, shape in shapes.items():
+        if (found := np.shape(operator.attrgetter(name)(views))) != shape:
+            raise ValueError(f"views.{name} must be {list(shape)} for {count} views of the camera's size, got {list(found)}")
 
 
 def from_views_batch(

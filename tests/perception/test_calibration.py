@@ -128,6 +128,18 @@ def test_a_blind_view_and_one_moved_too_far_keep_the_nominal_pose():
     np.testing.assert_array_equal(timid.world_from_cam, nominal().world_from_cam)
 
 
+def test_pixels_that_were_not_measured_do_not_count():
+    """Not a number, infinite and below 0 are 0, as in the map; millimetres are refused."""
+    true, depth = cases()[1]
+    blank = depth.at[:, :9].set(0.0)
+    for hole in (jnp.nan, jnp.inf, -1.0):
+        found = calibrate(depth.at[:, :9].set(hole), nominal())
+        np.testing.assert_array_equal(found.world_from_cam, calibrate(blank, nominal()).world_from_cam)
+    assert errors(found, true).max() < 1e-3
+    with pytest.raises(ValueError, match="depth must be floating point, metres, got uint16"):
+        calibration.calibrate((1000 * depth).astype(jnp.uint16), nominal(), surfaces)
+
+
 def test_jit_equals_eager_and_vmap_equals_a_loop():
     pairs = cases()[:2]
     loop = [calibrate(depth, nominal()).world_from_cam for _, depth in pairs]

@@ -240,6 +240,24 @@ def test_whole_numbers_of_real_cameras_are_refused(name, dtype, unit):
         topdown.from_views(raw, spec=SPEC)
 
 
+def test_shapes_that_do_not_fit_are_named():
+    views = table_views()
+    count, (height, width) = len(views.depth), views.depth.shape[1:]
+    wrong = {
+        "rgb": jnp.moveaxis(views.rgb, -1, 1),
+        "depth": views.depth[0],
+        "camera.intrinsics": views.camera.replace(intrinsics=views.camera.intrinsics[0]),
+        "camera.world_from_cam": views.camera.replace(world_from_cam=views.camera.world_from_cam[:1]),
+    }
+    for name, leaf in wrong.items():
+        with pytest.raises(ValueError, match=rf"views\.{name} must be \["):
+            topdown.from_views(views.replace(**{name.partition(".")[0]: leaf}), spec=SPEC)
+    with pytest.raises(
+        ValueError, match=rf"views\.depth must be \[{count}, {height}, {width}\] for {count} views.*got \[{count}, {height}, 7\]"
+    ):
+        topdown.from_views(views.replace(depth=views.depth[..., :7]), spec=SPEC)
+
+
 def test_the_order_of_views_does_not_matter():
     first = from_views(table_views(), spec=SPEC)
     second = from_views(table_views((2, 0, 3, 1)), spec=SPEC)

@@ -212,6 +212,7 @@ def test_an_area_out_of_reach_has_no_free_pose():
     [
         ("towers", {}, "unknown task 'towers', choose one of .*pallet, .*tower"),
         ("tower", {"size": 3}, "no option size; its options are colors, distractors, edge, max_actions, num_objects"),
+        ("tower", {"num_objects": -2}, "num_objects=-2 must be at least 1"),
         ("tower", {"num_objects": 7}, "num_objects=7 is not one of 1..6"),
         ("tower", {"edge": (0.05, 0.04)}, "edge="),
         ("tower", {"colors": "loud"}, r"colors='loud' is not one of \['code', 'paper', 'uniform'\]"),
@@ -328,6 +329,12 @@ class Own(tower.TowerTask):
         ("base", lambda leaf: leaf[None], r"a scene's base must be finite and of shape \(7,\), got \(1, 7\)"),
         ("goal", lambda leaf: leaf[:-1], r"a scene's goal must be finite and of shape \(5, 7\), got \(4, 7\)"),
         ("color", lambda leaf: leaf * np.nan, "a scene's color must be finite"),
+        ("color", lambda leaf: leaf * 255, r"a scene's color must be RGB in 0\.\.1, got .* to 2\d\d"),
+        ("symmetry", np.rad2deg, r"a scene's symmetry must be radians above 0 and at most 2 pi, got 90 to 90"),
+        ("symmetry", np.zeros_like, r"a scene's symmetry must be .* got 0 to 0"),
+        ("start", lambda leaf: leaf * 2, r"a scene's start must hold x, y, z and a unit quaternion .*, got one of length 2"),
+        ("goal", lambda leaf: leaf[:, [0, 1, 2, 4, 5, 6, 3]], "a scene's goal must stand upright, turned about z alone"),
+        ("base", lambda leaf: leaf * 0, "a scene's base must hold .*, got one of length 0"),
         ("size", lambda leaf: leaf * [1, 1, 0.45], r"objects must be at least 0.02 m high, .* got 0.0180"),
     ],
 )
@@ -335,6 +342,20 @@ def test_scenes_of_an_own_task_are_looked_at(name, change, message):
     with pytest.raises(ValueError, match=f"task tower: {message}"):
         Own(wrong=((name, change),)).sample(0)
     Own(wrong=(("size", lambda leaf: leaf * [1, 1, 0.5]),)).sample(0)
+
+
+def test_an_own_task_says_what_it_lacks(monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(Own, "base_color", (156, 117, 95))
+        with pytest.raises(ValueError, match=r"task tower: base_color must be RGB in 0\.\.1, got \(156, 117, 95\)"):
+            Own().sample(0)
+    with monkeypatch.context() as patch:
+        patch.setattr(tower.TowerTask, "build_distractors", base.Task.build_distractors)
+        with pytest.raises(ValueError, match="task tower has no build_distractors: without one it needs distractors=0, got 2"):
+            Own(distractors=2)
+    monkeypatch.setattr(Own, "build", lambda self, rng: None)
+    with pytest.raises(ValueError, match="task tower: build must return a types.Scene, got NoneType"):
+        Own().sample(0)
 
 
 def test_masses_of_an_own_task_are_counted(monkeypatch):

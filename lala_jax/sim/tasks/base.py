@@ -150,6 +150,10 @@ class Task:
         if self.colors not in COLOR_CHOICES:
             raise ValueError(f"task {self.name}: colors={self.colors!r} is not one of {sorted(COLOR_CHOICES)}")
         most = len(PALETTES.get(self.colors, COLORS)) - self.num_objects
+        if self.num_objects < 1:
+            raise ValueError(f"task {self.name}: num_objects={self.num_objects} must be at least 1")
+        if self.distractors and type(self).build_distractors is Task.build_distractors:
+            raise ValueError(f"task {self.name} has no build_distractors: without one it needs distractors=0, got {self.distractors}")
         if self.distractors and not 0 < self.distractors <= most:
             raise ValueError(f"task {self.name}: distractors={self.distractors} is not one of 0..{most}: each has a colour of its own")
         if self.budget < 1:
@@ -170,7 +174,7 @@ class Task:
 
     def build_distractors(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Draw the distractors' sizes `[D, 3]` in metres and symmetries `[D]` in radians."""
-        raise NotImplementedError(f"task {self.name} has no build_distractors: without one it needs distractors=0")
+        raise NotImplementedError
 
     def start_area(self, size: np.ndarray) -> Area:
         """Say where boxes of `size` `[N, 3]` lie at the start."""
@@ -186,6 +190,8 @@ class Task:
             raise ValueError(f"task {self.name}: seed={seed} must be at least 0")
         rng = np.random.default_rng([seed, zlib.crc32(self.name.encode())])
         scene = self.build(rng)
+        if not isinstance(scene, types.Scene):
+            raise ValueError(f"task {self.name}: build must return a types.Scene, got {type(scene).__name__}")
         if self.distractors:  # after all else: the other objects stay what they are without
             scene = self._with_distractors(rng, scene)
         drawn = types.Scene(**{field.name: np.asarray(getattr(scene, field.name), np.float32) for field in dataclasses.fields(scene)})
@@ -209,6 +215,13 @@ class Task:
             if (found := getattr(scene, name)).shape != shape or not np.isfinite(found).all():
                 found = found if found.shape == shape else found.shape
                 raise ValueError(f"task {self.name}: a scene's {name} must be finite and of shape {shape}, got {found}")
+        if wrong := types.out_of_range(scene):
+            raise ValueError(f"task {self.name}: a scene's {wrong}")
+        for name in ("base", "start", "goal"):
+            if (tilt := np.abs(getattr(scene, name)[..., 4:6]).max()) > 1e-3:
+                raise ValueError(f"task {self.name}: a scene's {name} must stand upright, turned about z alone, got qx or qy of {tilt:.4g}")
+        if not all(0.0 <= value <= 1.0 for value in self.base_color):
+            raise ValueError(f"task {self.name}: base_color must be RGB in 0..1, got {self.base_color}")
         if (lowest := scene.size[:, 2].min()) < LOWEST - 1e-6:
             raise ValueError(f"task {self.name}: objects must be at least {LOWEST} m high, or the score mixes up levels, got {lowest:.4f}")
 
