@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import json
 import pathlib
 from collections.abc import Sequence
 from typing import Any
@@ -82,6 +83,10 @@ def main(
         return {"task": task, "split": "val", "steps": steps, "demos": demos, "seed": seed, "reference": chosen[0].name}
 
     path = pathlib.Path(out) / f"ablation-{task}.json"
+    if common.read(path):
+        held, asked = json.loads(path.read_text()), {"--steps": steps, "--demos": demos, "--seed": seed}
+        if other := [f"{flag}={held[flag[2:]]}" for flag, value in asked.items() if held[flag[2:]] != value]:
+            raise options.OptionsError(f"{path} holds rows of {' '.join(other)}: give another --out")
     work, before = functools.partial(run, base=base, runs=runs, seeds=seeds), common.recordings([row for row in chosen if row.trains], base)
     done = common.fill(path, chosen, work, finish, config=base, seeds=seeds, launch=launch, before=before)
     print(f"\n{table(done)}\n\n{path}")

@@ -42,6 +42,9 @@ def main(config, workdir, *, task: str, stages: str, growth: bool, repeats: int,
     """Time the stages of a task, and compare them with an earlier run's."""
     del workdir
     common.check_task(config, task)
+    for flag, value, least in (("--repeats", repeats, 1), ("--limit", limit, 0)):
+        if value < least:
+            raise options.OptionsError(f"{flag} must be at least {least}, got {value}")
     every, ceilings = benchmark_stages.STAGES, benchmark_stages.CEILINGS
     known = [name for name in every if name not in ceilings]
     wanted = [options.check_choice("--stages", name, known) for name in stages.split(",") if name] or known
@@ -58,6 +61,7 @@ def main(config, workdir, *, task: str, stages: str, growth: bool, repeats: int,
             raise options.OptionsError(f"{path} holds how cost grows, which this leaves out: give --growth=true or another --out")
     apart = jax.default_backend() == "cpu"  # a GPU's memory is this process's
     rows, grown = [], []
+    writers.make_directory(path.parent)
 
     def report() -> dict[str, Any]:
         return {"task": task, **here, **judged(rows, task), "growth": grown}

@@ -2,7 +2,7 @@
 
 Every file is `{"task", ..., "rows": [...]}`. A row has `name`, `label`, what identifies it (`overrides`, `revision`, `seeds`,
 `checkpoint` or null, `config`, `beside`), its scores (`score`, `interval95`, `complete_percent`, `first_failures`, ..., `scores` by seed)
-and `seconds`, how long it took.
+and `seconds`, how long its last start took.
 Rows run one after the other in this process, or each in a worker of its own.
 """
 
@@ -150,10 +150,13 @@ def fill(
     rows are run by workers, after what they share, `before`; where some are missing in the end, the file holds the others, and
     SystemExit is raised.
     """
+    writers.make_directory(path.parent)
     stored = read(path)
     order = [*stored, *(row.name for row in rows)]
     wanted = {row.name: identity(row, config, seeds, weights=weights) for row in rows}  # of all, before the first is run
     found, done = {name: stored[name] for name, own in wanted.items() if name in stored and is_same(stored[name], own)}, {}
+    if replaced := [name for name in wanted if name in stored and name not in found]:
+        print(f"{path} holds {', '.join(replaced)} of other settings: replaced once they are run", flush=True)
     results = _here(rows, found, run, wanted) if launch is None else _fanned(launch, path, rows, found, run, wanted, before)
     for row, result in results:
         done[row.name] = result | {"label": row.label}
@@ -173,8 +176,12 @@ def _is_old(stored: Mapping[str, Any], known: Sequence[Row]) -> bool:
 
 
 def read(path: pathlib.Path) -> dict[str, dict[str, Any]]:
-    """Read the rows of a file by name; none where there is no file."""
-    return {row["name"]: row for row in json.loads(path.read_text())["rows"]} if path.exists() else {}
+    """Read the rows of a file by name; none where there is no file. Raises OptionsError where it is something else."""
+    try:
+        return {row["name"]: row for row in json.loads(path.read_text())["rows"]} if path.exists() else {}
+    except (ValueError, KeyError, TypeError) as error:
+        text = f"{path} is damaged or no file of rows ({type(error).__name__} {error}): move it away, or give another --out"
+        raise options.OptionsError(text) from error
 
 
 def outcome(row: Row, run: Callable[[Any], Mapping[str, Any]], own: Mapping[str, Any]) -> dict[str, Any]:

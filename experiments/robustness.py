@@ -118,9 +118,16 @@ def counted(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{n} {name}" for name, n in sorted(counts.items(), key=lambda item: -item[1]) if n)
 
 
+def stored_config(flags):
+    """Give the config of the checkpoint."""
+    if not flags["checkpoint"]:
+        raise options.OptionsError("give --checkpoint=PATH")
+    return evaluate.stored_config(flags)
+
+
 def command(argv: Sequence[str] | None = None):
     """Run from the command line."""
-    return options.run(main, flags=FLAGS, config_from=evaluate.stored_config, workdir=".", user_errors=common.USER_ERRORS, argv=argv)
+    return options.run(main, flags=FLAGS, config_from=stored_config, workdir=".", user_errors=common.USER_ERRORS, argv=argv)
 
 
 if __name__ == "__main__":

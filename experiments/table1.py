@@ -24,7 +24,7 @@ from typing import Any
 import jax
 
 from experiments import common
-from lala_jax import build, cluster, compiling, options, pretrain, scoring, state
+from lala_jax import build, cluster, compiling, options, pretrain, scoring, state, writers
 from lala_jax.sim import tasks
 
 
@@ -301,7 +301,8 @@ def write(out: pathlib.Path, scale: str, seeds: Sequence[int], bases: Mapping[st
     """Write `<scale>.md` and `<scale>.webp` from the results of both tasks, whose rows change `bases`, and print the table."""
     rows = stored(out, scale, seeds, bases)
     text = table(rows)
-    (out / f"{scale}.md").write_text(text + "\n")
+    with writers.atomic(out / f"{scale}.md") as file:
+        file.write(f"{text}\n".encode())
     try:
         bars(rows, out / f"{scale}.webp")
     except ModuleNotFoundError as error:
@@ -357,7 +358,8 @@ def bars(results: Mapping[str, Mapping[str, Mapping[str, Any]]], path: pathlib.P
     if told:
         drawing.legend(list(told.values()), list(told), loc="outside lower center", ncols=len(told), fontsize="small")
     axes[0].invert_yaxis()
-    drawing.savefig(path, dpi=100)
+    with writers.atomic(path) as file:
+        drawing.savefig(file, format=path.suffix[1:], dpi=100)
 
 
 def command(argv: Sequence[str] | None = None):

@@ -14,6 +14,7 @@ from lala_jax import (
     backbone,
     checkpoint,
     dataset,
+    defaults,
     encoders,
     observe,
     optim,
@@ -35,8 +36,6 @@ from lala_jax.sim.tasks import base
 MODELS = ("goal_aware", *transporter.VARIANTS, "cliport", "graph")
 DTYPES = ("float32", "bfloat16")  # of model.dtype
 CLIP_STAGES = (2, 3, 4)  # of CLIP's trunk, that cliport may take
-# What configs in checkpoints that are older than a field mean.
-NEWER = {"augment.mix": 0.5, "model.clip": "", "model.clip_tokenizer": "", "model.clip_stages": 0, "model.dtype": "float32"}
 SPLITS = ("train", "val", "test")
 TEST_START = 10_001
 WORKDIR = "runs/<task>"  # the default of --workdir
@@ -96,11 +95,16 @@ def observer(config: Mapping[str, Any]) -> observe.Observer:
     options.check_choice("camera.preset", fields["preset"], scene.PRESETS)
     for name in ("height", "width"):
         _positive(f"camera.{name}", fields[name])
+    for name in ("shift", "turn"):
+        _not_negative(f"camera.{name}", fields.get(name, 0.0))
     surface(config)
     built = observe.Observer(task=task(config), spec=map_spec(config), dtype=network_dtype(config), **fields)
-    options.check_choice("camera.missing", built.missing, range(-1, len(built.camera.intrinsics)))
     try:
+        count = len(built.camera.intrinsics)
+        options.check_choice("camera.missing", built.missing, range(-1, count))
         built.check()
+    except options.OptionsError:
+        raise
     except ValueError as error:
         raise options.OptionsError(f"camera.preset {built.preset!r}: {error}") from error
     return built
@@ -126,7 +130,7 @@ def backbone_identity(config: Mapping[str, Any]) -> dict[str, str]:
 
 def network_dtype(config: Mapping[str, Any]) -> str:
     """Give the type that networks compute in, the backbone among them."""
-    return options.check_choice("model.dtype", config["model"].get("dtype", NEWER["model.dtype"]), DTYPES)
+    return options.check_choice("model.dtype", config["model"].get("dtype", defaults.NEWER["model.dtype"]), DTYPES)
 
 
 def build_policy(config: Mapping[str, Any]) -> policy.Policy:
@@ -134,8 +138,9 @@ def build_policy(config: Mapping[str, Any]) -> policy.Policy:
     fields, spec = config["model"], map_spec(config)
     options.check_choice("model.name", fields["name"], MODELS)
     files = clip_files(config)
-    for name in ("rotations", "crop", "channels", "width", "stages", "trunk_width", "tokens"):
+    for name in ("rotations", "crop", "channels", "width", "stages", "trunk_width", "trunk_blocks", "tokens"):
         _positive(f"model.{name}", fields[name])
+    _not_negative("model.match_weight", fields["match_weight"])
     shared = {"crop": fields["crop"], "channels": fields["channels"]}
     if surface(config) and fields["name"] not in transporter.VARIANTS:
         known = ", ".join(transporter.VARIANTS)
@@ -171,7 +176,7 @@ def build_policy(config: Mapping[str, Any]) -> policy.Policy:
 def clip_files(config: Mapping[str, Any]) -> dict[str, Any]:
     """Give CLIP's `weights`, its `tokenizer` and how many `stages` of its trunk cliport takes, where the config names its files."""
     fields = config["model"]
-    weights, tokenizer, stages = (fields.get(name, NEWER[f"model.{name}"]) for name in ("clip", "clip_tokenizer", "clip_stages"))
+    weights, tokenizer, stages = (fields.get(name, defaults.NEWER[f"model.{name}"]) for name in ("clip", "clip_tokenizer", "clip_stages"))
     if not (weights or tokenizer or stages):
         return {}
     if fields["name"] != "cliport":
@@ -191,7 +196,7 @@ def clip_identity(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _mix(config: Mapping[str, Any]) -> float:
-    return _share("augment.mix", config["augment"].get("mix", NEWER["augment.mix"]))
+    return _share("augment.mix", config["augment"].get("mix", defaults.NEWER["augment.mix"]))
 
 
 def _check_names(config: Mapping[str, Any]) -> None:
@@ -210,8 +215,27 @@ def _check_numbers(config: Mapping[str, Any]) -> None:
         _share(f"{group}.{name}", config[group][name])
     for name in ("shift", "turn"):
         _not_negative(f"augment.{name}", config["augment"][name])
+    for name in ("warmup", "weight_decay"):
+        _not_negative(f"optim.{name}", config["optim"][name])
+    _positive("optim.learning_rate", config["optim"]["learning_rate"])
     if not (clip := config["optim"]["clip"]) > 0.0:  # with 0 nothing is learnt
         raise options.OptionsError(f"config field optim.clip must be above 0 (inf for no clipping), got {clip!r}")
+
+
+def _check_palette(config: Mapping[str, Any]) -> None:
+    """Raise where objects would be given more colours than there are."""
+    built = task(config)
+    count, colors = built.num_objects + built.distractors, len(train_step.palette(built))
+    if config["augment"]["recolor"] and count > colors:
+        raise options.OptionsError(f"augment.recolor has {colors} colours for the {count} objects of task {built.name}: give false")
+
+
+def check_data(config: Mapping[str, Any]) -> None:
+    """Raise OptionsError where the group `data` asks for demonstrations that cannot be, before any is recorded."""
+    for name in ("demos", "threads"):
+        _positive(f"data.{name}", config["data"][name])
+    mistakes(config)
+    split_seeds("train", 0, config["data"]["demos"])
 
 
 def check_evaluation(config: Mapping[str, Any]) -> None:
@@ -232,7 +256,10 @@ def recipe(config: Mapping[str, Any]) -> train_step.Recipe:
     if config["model"]["name"] == "cliport":
         _check_names(config)
     _check_numbers(config)
+    check_data(config)
     check_evaluation(config)
+    backbone_identity(config)  # finds its file
+    _check_palette(config)
     split_seeds("val", SELECTION_START, train["eval_episodes"])
     sensors = train_step.augment.Sensors(**{name: augment[name] for name in ("depth_noise", "shift", "turn", "missing")})
     options.check_choice("optim.schedule", config["optim"]["schedule"], optim.SCHEDULES)
@@ -272,6 +299,7 @@ def pretrain_recipe(config: Mapping[str, Any]) -> pretrain_step.Recipe:
         raise options.OptionsError(f"pretrain.window must be a multiple of pretrain.patch={patch} and at most {side}, got {window!r}")
     if not 0 < fields["mask"] <= 1 or not round(fields["mask"] * (window // patch) ** 2):
         raise options.OptionsError(f"config field pretrain.mask must be a share up to 1 that covers a patch, got {fields['mask']!r}")
+    _check_palette(config)
     options.check_choice("camera.stage", camera["stage"], resnet.STAGES)
     options.check_choice("optim.schedule", optimiser["schedule"], optim.SCHEDULES)
     # Stored means and variances that are 0 and 1 ask for inputs of about one, torchvision's.
@@ -304,7 +332,7 @@ def run_settings(config: Mapping[str, Any]) -> dict[str, Any]:
     """
     free = ("pretrain.", "eval.", "data.directory", "data.threads")
     free += ("train.log_every", "train.save_every", "train.eval_every", "train.eval_episodes", "train.shard_state")
-    return {name: value for name, value in (NEWER | options.fields(config)).items() if not name.startswith(free)}
+    return {name: value for name, value in (defaults.NEWER | options.fields(config)).items() if not name.startswith(free)}
 
 
 def input_spec(config: Mapping[str, Any]) -> dict[str, Any]:

@@ -202,7 +202,11 @@ def _candidates(path: pathlib.Path, which: str) -> list[tuple[pathlib.Path, int]
     folders = [path / which, path / ("latest" if which == "best" else "best")]
     found = [(folder, step) for folder in folders for step in _steps(folder)]
     if not found:
-        raise CheckpointError(f"no checkpoint at {path}: looked for steps in {folders[0]} and {folders[1]}")
+        below, above = path / "checkpoints", path.parent if path.name in ("best", "latest") else path.parent.parent
+        near = next((folder for folder in (below, above) if any(_steps(folder / one) for one in ("best", "latest"))), None)
+        there = [str(folder / str(step)) for folder in (near / "best", near / "latest") for step in _steps(folder)] if near else []
+        hint = f"; did you mean {near}, or one of its steps, {', '.join(there)}?" if near else ""
+        raise CheckpointError(f"no checkpoint at {path}: looked for steps in {folders[0]} and {folders[1]}{hint}")
     if found[0][0] != folders[0]:
         _LOG.warning("%s holds no step, taking %s", folders[0], folders[1])
     return found

@@ -53,8 +53,11 @@ class Task:
         """Give what the part holds, `key` and `result`; None where there is none of this task."""
         if self.part is None or not self.part.exists():
             return None
-        stored = json.loads(self.part.read_text())
-        return stored if stored["key"] == writers.plain(self.key) else None
+        try:
+            stored = json.loads(self.part.read_text())
+            return stored if stored["key"] == writers.plain(self.key) and "result" in stored else None
+        except (ValueError, KeyError, TypeError):  # damaged: to be done again
+            return None
 
     def __call__(self) -> Any:
         """Do the task in a worker, unless it is done by now, and keep the result."""

@@ -3,10 +3,18 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
+from typing import Any
 
 import ml_collections
 
 ARGUMENTS = ("", "smoke", "paper")
+# What configs in checkpoints and results that are older than a field mean.
+NEWER = {
+    **{"task.distractors": 0, "data.mistakes": 0.0, "augment.mix": 0.5, "train.shard_state": False},
+    **{"camera.backbone": "", "camera.stage": "conv2"},
+    **{"model.clip": "", "model.clip_tokenizer": "", "model.clip_stages": 0, "model.dtype": "float32"},
+}
 
 
 def get(arg: str, *, task: str) -> ml_collections.ConfigDict:
@@ -23,7 +31,7 @@ def get(arg: str, *, task: str) -> ml_collections.ConfigDict:
     config.task.distractors = 0  # further objects on the table that the goal does not show
 
     config.data = ml_collections.ConfigDict()
-    config.data.directory = f"data/{task}"  # demonstrations, collected there if there are none
+    config.data.directory = f"data/{task}"  # demonstrations, recorded there in simulation until there are data.demos
     config.data.demos = 500
     config.data.mistakes = 0.0  # share of the demonstrations' actions that are spoiled, so that they show how to recover
     config.data.threads = os.cpu_count() or 1  # of physics, in collection and evaluation
@@ -152,3 +160,13 @@ def _enlarge(config) -> None:
     config.train.eval_every = 5000
     config.pretrain.window, config.pretrain.patch = 128, 16
     config.eval.parallel = 4
+
+
+def complete(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Give a stored config with the fields that it is older than, in the groups that it has."""
+    groups = {name: dict(group) if isinstance(group, Mapping) else group for name, group in config.items()}
+    for field, value in NEWER.items():
+        group, name = field.split(".")
+        if group in groups:
+            groups[group].setdefault(name, value)
+    return groups

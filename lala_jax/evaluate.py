@@ -31,6 +31,7 @@ def main(
     build.check_evaluation(config)
     out = pathlib.Path(build.workdir(config, workdir))
     parts = out / f"scores-{agent}-{split}.parts"
+    writers.make_directory(out)
     result, strips, weights = score(config, checkpoint, agent, seeds, launch, parts)
     source = checkpoint if agent == "policy" else None
     scoring.write_scores(config, result, strips, out, agent=agent, split=split, seeds=seeds, source=source, weights=weights)
@@ -49,6 +50,8 @@ def score(config, checkpoint: str, agent: str, seeds: Sequence[int], launch: clu
             raise options.OptionsError(NO_CHECKPOINT)
         built, observer = build.build_policy(config), build.observer(config)
         params = scoring.check_checkpoint(checkpoint, config, built)
+        if (trained := pretrained.describe(checkpoint)["config"]["task"]["name"]) != config.task.name:
+            print(f"{checkpoint} was trained on {trained}, this is {config.task.name}", flush=True)
         weights = pretrained.fingerprint(checkpoint, params)
         if launch is None:
             result, strips = scoring.evaluate(

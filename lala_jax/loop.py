@@ -72,14 +72,21 @@ def start_or_resume(
     """
     frozen = frozen or {}
     fresh = parallel.place(fresh, mesh, shard=shard)  # committed, as what is restored: both then run one compiled step
-    found = store.restore_latest(fresh)
+
+    def check(stored: Mapping[str, Any]) -> None:
+        there = settings(stored["config"]) | options.fields({name: stored["input_spec"].get(name, {}) for name in frozen})
+        here = settings(writers.plain(options.to_dict(config))) | options.fields(frozen)
+        if changed := options.differences(there, here):
+            raise checkpoint.CheckpointError(f"{store.directory} holds a run with another {', '.join(changed)}: choose another --workdir")
+
+    try:
+        found = store.restore_latest(fresh)
+    except checkpoint.MismatchError:  # the settings say in the user's terms why leaves do not fit
+        check(checkpoint.describe(store.directory, which="latest"))
+        raise
     if found is None:
         return fresh
-    stored = checkpoint.describe(store.directory / "latest" / str(found[0]))
-    there = settings(stored["config"]) | options.fields({name: stored["input_spec"].get(name, {}) for name in frozen})
-    here = settings(writers.plain(options.to_dict(config))) | options.fields(frozen)
-    if changed := options.differences(there, here):
-        raise checkpoint.CheckpointError(f"{store.directory} holds a run with another {', '.join(changed)}: choose another --workdir")
+    check(checkpoint.describe(store.directory / "latest" / str(found[0])))
     return found[1]
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import ast
 import copy
 import difflib
+import errno
 import importlib.util
 import inspect
 import pathlib
@@ -20,6 +21,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import ml_collections
+
+# Errors of the system that the user can mend.
+UNWRITABLE = {errno.EACCES, errno.EEXIST, errno.EISDIR, errno.ENOSPC, errno.ENOTDIR, errno.EPERM, errno.EROFS}
 
 
 class OptionsError(ValueError):
@@ -111,14 +115,15 @@ def run(
       workdir: default of `--workdir`, which is required without one.
       owned: gives from the flags the fields that the program sets itself, and the flag, or whatever else, that says to what:
         `--config.x=y` of one is refused.
-      user_errors: exceptions out of `main` that, like OptionsError, end with status 2 and their message alone.
+      user_errors: exceptions out of `main` that, like OptionsError and files that the system refuses, end with status 2 and their
+        message alone. Ctrl-C ends with status 130.
       argv: arguments without the program's name; those of the process by default.
     """
     program = _program()
     try:
         given = _parse(sys.argv[1:] if argv is None else argv, dict(flags or {}))
         if given["help"]:
-            print(_usage(program, main, dict(flags or {}), given["config"]))
+            print(_usage(program, main, dict(flags or {}), given["config"], workdir))
             return None
         directory = workdir if given["workdir"] is None else given["workdir"]
         if not directory:
@@ -134,6 +139,14 @@ def run(
     except (OptionsError, *user_errors) as error:
         print(f"{program}: {error}\n(--help lists the flags, and with --config its fields)", file=sys.stderr)
         raise SystemExit(2) from None
+    except OSError as error:
+        if error.errno not in UNWRITABLE or error.filename is None:
+            raise
+        print(f"{program}: cannot read or write {error.filename}: {error.strerror}", file=sys.stderr)
+        raise SystemExit(2) from None
+    except KeyboardInterrupt:
+        print(f"\n{program}: stopped; the same command goes on from what is on disk", file=sys.stderr)
+        raise SystemExit(130) from None
 
 
 def _check_owned(overrides: Iterable[str], owned: Mapping[str, str]) -> None:
@@ -314,10 +327,13 @@ def _parse(argv: Sequence[str], flags: dict[str, Any]) -> dict[str, Any]:
     return given
 
 
-def _usage(program: str, main: Callable[..., Any], flags: dict[str, Any], config: str | None) -> str:
-    """Compose the help text, with the fields of `config` where one is named."""
-    lines = [f"usage: python -m {program} --config=FILE.py[:ARGUMENT] --workdir=DIRECTORY [--config.FIELD=VALUE ...]"]
-    lines += [inspect.getdoc(main) or ""]
+def _usage(program: str, main: Callable[..., Any], flags: dict[str, Any], config: str | None, workdir: str | None) -> str:
+    """Compose the help text from what the module of `main` says of itself, with the fields of `config` where one is named."""
+    lines = [
+        f"usage: python -m {program} [--config=FILE.py[:ARGUMENT]] [--workdir=DIRECTORY] [--FLAG=VALUE ...] [--config.FIELD=VALUE ...]"
+    ]
+    lines += [f"\n{inspect.getdoc(sys.modules[main.__module__]) or ''}\n", "flags and their defaults:"]
+    lines += [f"  --workdir={workdir!r}" if workdir else "  --workdir=DIRECTORY, required"]
     lines += [f"  --{name.replace('_', '-')}={default!r}" for name, default in flags.items()]
     if config is not None:
         lines += [f"  --config.{name}={value!r}" for name, value in fields(load(config)).items()]

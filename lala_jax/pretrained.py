@@ -23,7 +23,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from lala_jax import checkpoint, options
+from lala_jax import checkpoint, defaults, options
 
 FORMAT_VERSION = 1
 WEIGHTS = pathlib.Path(__file__).resolve().parent / "weights"
@@ -67,15 +67,16 @@ def load(path: str | os.PathLike[str]) -> tuple[Any, dict[str, Any], dict[str, A
     """
     folder, found = find(path), card(path)
     if found is not None:
-        return _read_arrays(folder / ARRAYS, found), found["config"], found["input_spec"]
+        return _read_arrays(folder / ARRAYS, found), defaults.complete(found["config"]), found["input_spec"]
     state, config, input_spec = checkpoint.load(folder)
-    return state["average"], config, input_spec
+    return state["average"], defaults.complete(config), input_spec
 
 
 def describe(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Give at least `step`, `config` and `input_spec` of what `load` reads, parameters unread."""
+    """Give at least `step`, `config` (with the fields that it is older than) and `input_spec` of what `load` reads, parameters unread."""
     found = card(path)
-    return checkpoint.describe(find(path)) if found is None else found
+    found = checkpoint.describe(find(path)) if found is None else found
+    return {**found, "config": defaults.complete(found["config"])}
 
 
 def fingerprint(path: str | os.PathLike[str], params: Any) -> dict[str, Any]:
@@ -140,7 +141,8 @@ def _read_arrays(file: pathlib.Path, found: Mapping[str, Any]) -> dict[str, Any]
 
 def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> list[str]:
     """List the fields that decide a score and are not the same in two configs (as JSON holds them)."""
-    return options.differences(*(options.fields({group: config[group] for group in COMPARED}) for config in (there, here)))
+    whole = (defaults.complete(config) for config in (there, here))
+    return options.differences(*(options.fields({group: config[group] for group in COMPARED}) for config in whole))
 
 
 def verdict(

@@ -27,8 +27,10 @@ def collect(config: Mapping[str, Any], *, quiet: bool = False, launch: cluster.L
 
     Goes on where an earlier run stopped, and waits for another that is at it; a directory that has enough is left alone. With `launch`
     workers record the shards, and the files are the same. Raises `dataset.DatasetError` where the directory holds another task and
-    where the oracle solves none of the first `HOPE` scenes, `options.OptionsError` where the train split runs out of seeds.
+    where the oracle solves none of the first `HOPE` scenes, `options.OptionsError` where `data` asks for what cannot be or the train split
+    runs out of seeds.
     """
+    build.check_data(config)
     directory, identity = pathlib.Path(config["data"]["directory"]), build.data_identity(config)
     done = dataset.seeds(directory)
     if done.size:
@@ -43,6 +45,9 @@ def _complete(config, directory: pathlib.Path, identity: Mapping[str, Any], *, q
     """Record what the directory lacks."""
     done, wanted = dataset.seeds(directory), config["data"]["demos"]
     kept, place = len(done), (int(done.max()) // 2 + 1 if done.size else 0)
+    plan(place, wanted - kept)  # raises now, not after hours, where there are not so many seeds
+    if kept and not quiet:
+        print(f"{directory} holds {kept} demonstrations: recording {wanted - kept} more in simulation", flush=True)
     columns = (*progress.Progress.get_default_columns(), progress.MofNCompleteColumn())
     with progress.Progress(*columns, disable=quiet or launch is not None) as bar:
         shown = bar.add_task(f"demonstrations of {identity['task']}", total=wanted, completed=kept)

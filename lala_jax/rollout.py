@@ -171,7 +171,7 @@ def head(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "episodes": len(lines),
         "score": float(scores.mean()),
         "interval95": interval(scores),
-        "complete_percent": 100.0 * float(np.mean([line["complete"] for line in lines])),
+        "complete_percent": 100.0 * sum(line["complete"] for line in lines) / len(lines),
         "actions": sum(line["actions"] for line in lines),
     }
 

@@ -259,8 +259,10 @@ def write_scores(
     facts |= {"checkpoint": source, "weights": weights}
     writers.write_json(path, {**facts, "device": jax.devices()[0].device_kind, **result, "config": options.to_dict(config)})
     low, high = result["interval95"]
+    reach = "" if np.isnan(low) else f" [{low:.1f}, {high:.1f}]"
+    wrong = ", ".join(f"{count} {cause}" for cause, count in result["first_failures"].items() if count and cause != "none")
     print(
-        f"{config.task.name} {agent}, {split} split, {result['episodes']} episodes: score {result['score']:.1f} [{low:.1f}, {high:.1f}], "
-        f"complete {result['complete_percent']:.0f}%; {path}",
+        f"{config.task.name} {agent}, {split} split, {result['episodes']} episodes: score {result['score']:.1f}{reach}, "
+        f"complete {result['complete_percent']:.0f}%{f', first to go wrong: {wrong}' if wrong else ''}; {path}",
         flush=True,
     )

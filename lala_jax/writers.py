@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import math
 import os
@@ -42,6 +43,15 @@ def _sync_directory(directory: pathlib.Path) -> None:
             os.fsync(descriptor)
         finally:
             os.close(descriptor)
+
+
+def make_directory(path: str | os.PathLike[str]) -> pathlib.Path:
+    """Make a directory and its parents; raises OSError, before the work that is to be kept there, where nothing can be written to it."""
+    path = pathlib.Path(path)
+    path.mkdir(parents=True, exist_ok=True)
+    if not os.access(path, os.W_OK):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+    return path
 
 
 def plain(value: Any) -> Any:
@@ -147,6 +157,8 @@ class Writer:
         self._file.flush()
         if self._board is not None:
             for name in values:
+                if not math.isfinite(record[name]):  # undefined here, or a gap in the curve
+                    continue
                 self._board.add_scalar(name, record[name], int(step))
 
     def close(self) -> None:

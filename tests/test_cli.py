@@ -87,6 +87,8 @@ def test_another_setting_needs_another_workdir(trained, call):
         call("lala_jax.train", f"--workdir={workdir}", *tiny(data, "optim.learning_rate=0.5")),
         r"another optim.learning_rate \(0.001 there, 0.5 here\)",
     )
+    answer = call("lala_jax.train", f"--workdir={workdir}", *tiny(data, "model.width=8"))
+    refused(answer, r"another model.width \(\d+ there, 8 here\): choose another --workdir")
     assert (workdir / "config.json").read_bytes() == before
 
 
@@ -141,6 +143,12 @@ def refused(answer, *messages):
         ("model.crop=6", ["goal_aware needs map rows, map cols and model.crop in multiples of 4, got 80, 40 and 6"]),
         ("map.cell=0.3", ["MapSpec.x .* not a whole number"]),
         ("optim.clip=0.0", [r"config field optim.clip must be above 0 \(inf for no clipping\), got 0.0"]),
+        ("optim.learning_rate=-1.0", ["config field optim.learning_rate must be above 0, got -1.0"]),
+        ("optim.warmup=-1", ["config field optim.warmup must be at least 0, got -1"]),
+        ("model.trunk_blocks=-1", ["config field model.trunk_blocks must be above 0, got -1"]),
+        ("camera.shift=-1.0", ["config field camera.shift must be at least 0, got -1.0"]),
+        ("data.demos=-3", ["config field data.demos must be above 0, got -3"]),
+        ("data.demos=6000", [r"the train split has 5000 seeds, asked for 0\.\.5999"]),
         ("augment.missing=10.0", ["config field augment.missing must be at least 0 and at most 1, got 10.0"]),
         ("augment.turn=-1.0", ["config field augment.turn must be at least 0, got -1.0"]),
         ("data.threads=0", ["config field data.threads must be above 0, got 0"]),
@@ -194,6 +202,30 @@ def test_a_checkpoint_of_another_size_is_refused(trained, call, tmp_path):
         call("lala_jax.evaluate", where, f"--workdir={tmp_path}", "--config.model.width=8"),
         r"is of another model: \S+ is \(\S.*\) there, \(\S.*\) in the config",
     )
+
+
+def test_near_misses_of_a_checkpoint_are_told(trained, call, tmp_path):
+    own = trained[1] / "checkpoints"
+    for wrong in (trained[1], own / "latest", own / "latest" / "7"):
+        answer = call("lala_jax.evaluate", f"--checkpoint={wrong}", f"--workdir={tmp_path}")
+        refused(answer, rf"did you mean {own}, or one of its steps, {own}/best/\d, .*{own}/latest/2")
+
+
+def test_what_cannot_be_written_is_told_before_the_work(trained, call, tmp_path):
+    (tmp_path / "file").write_text("")
+    asked = f"--workdir={tmp_path / 'file' / 'x'}"
+    for answer in (
+        call("lala_jax.train", asked, *tiny(trained[0])),
+        call("lala_jax.evaluate", asked, "--agent=oracle", "--episodes=1", *tiny(trained[0])),
+        call("lala_jax.collect", *tiny(tmp_path / "file")),
+    ):
+        refused(answer, rf"cannot read or write {tmp_path / 'file'}.*: (Not a directory|File exists)")
+
+
+def test_collection_is_refused_what_cannot_be(call, tmp_path):
+    refused(call("lala_jax.collect", *tiny(tmp_path / "data", "data.demos=0")), "config field data.demos must be above 0, got 0")
+    refused(call("lala_jax.collect", *tiny(tmp_path / "data", "data.threads=-1")), "config field data.threads must be above 0, got -1")
+    assert not (tmp_path / "data").exists()
 
 
 def test_truncated_demonstrations_are_refused(trained, call, tmp_path):

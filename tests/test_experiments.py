@@ -119,7 +119,7 @@ def filled(path, config, *rows, weights=None, fails=()):
     return ran, done
 
 
-def test_finished_rows_are_kept_and_changed_ones_run_again(tmp_path):
+def test_finished_rows_are_kept_and_changed_ones_run_again(tmp_path, capsys):
     path, config = tmp_path / "there" / "rows.json", tiny_config()
     first, second, third = (common.Row(name, name, overrides) for name, overrides in [("a", ()), ("b", ("seed=3",)), ("c", ())])
     assert filled(path, config, first, second, third, fails=("c",)) == (["a", "b"], None)  # stopped in the third
@@ -127,7 +127,9 @@ def test_finished_rows_are_kept_and_changed_ones_run_again(tmp_path):
     ran, rows = filled(path, config, first, second, third)
     assert ran == ["c"] and [row["name"] for row in rows or ()] == ["a", "b", "c"]
     assert filled(path, config, first, second, third)[0] == []
+    capsys.readouterr()
     assert filled(path, config, first, common.Row("b", "another label", ("seed=4",)), third)[0] == ["b"]
+    assert f"{path} holds b of other settings: replaced once they are run" in capsys.readouterr().out
     stored = json.loads(path.read_text())["rows"]
     assert [(row["name"], row["label"], row["overrides"]) for row in stored] == [
         ("a", "a", [[]]),
@@ -332,6 +334,11 @@ def test_the_ablation_trains_each_row_once(trains, monkeypatch, tmp_path, capsys
     assert "| one-hot labels | 62.0 [60.9, 63.1] | 0% | -30.0 [-72.2, +48.3] | 10 |" in capsys.readouterr().out
     ablation.command([*given, "--rows=one-hot,slices"])
     assert [name for name, _ in trains[2:]] == [str(runs / "slices")]
+    before = (tmp_path / "ablation-tower.json").read_bytes()
+    with pytest.raises(SystemExit, match="2"):
+        ablation.command([*given, "--steps=6", "--rows=one-hot"])
+    assert "ablation-tower.json holds rows of --steps=5: give another --out" in capsys.readouterr().err
+    assert (tmp_path / "ablation-tower.json").read_bytes() == before and len(trains) == 3
 
 
 def test_the_main_table_averages_over_seeds(trains, tmp_path, capsys):
@@ -462,6 +469,15 @@ def test_robustness_end_to_end(tmp_path, capsys, monkeypatch):
     assert "| one camera of four missing, each in a quarter | " in capsys.readouterr().out
     monkeypatch.setattr(common, "score", None)
     assert robustness.command(given) == rows
+
+
+@pytest.mark.parametrize("content", ['{"rows": [{"na', "[]", '{"rows": [1]}', '{"rows": [{"label": "a"}]}'])
+def test_a_damaged_file_is_named_and_stays(content, tmp_path, capsys):
+    (tmp_path / "ablation-tower.json").write_text(content)
+    with pytest.raises(SystemExit, match="2"):
+        ablation.command(["--task=tower", f"--out={tmp_path}"])
+    assert "ablation-tower.json is damaged or no file of rows (" in capsys.readouterr().err
+    assert (tmp_path / "ablation-tower.json").read_text() == content
 
 
 def test_a_wrong_request_ends_with_one_message(tmp_path, capsys):

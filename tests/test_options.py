@@ -210,10 +210,39 @@ def test_run_shows_only_the_message_of_user_errors(file, capsys):
         options.run(main, argv=argv)
 
 
+def test_what_the_system_refuses_and_ctrl_c_have_no_traceback(file, tmp_path, capsys):
+    def main(config, workdir):
+        (tmp_path / "file" / "below").mkdir()
+
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SystemExit, match="2"):
+        options.run(main, argv=[f"--config={file}", "--workdir=x"])
+    assert f"cannot read or write {tmp_path / 'file' / 'below'}: Not a directory" in capsys.readouterr().err
+
+    def stopped(config, workdir):
+        raise KeyboardInterrupt
+
+    with pytest.raises(SystemExit, match="130"):
+        options.run(stopped, argv=[f"--config={file}", "--workdir=x"])
+    assert "stopped; the same command goes on from what is on disk" in capsys.readouterr().err
+
+    def defect(config, workdir):
+        (tmp_path / "nothing").read_text()
+
+    with pytest.raises(FileNotFoundError):
+        options.run(defect, argv=[f"--config={file}", "--workdir=x"])
+
+
 def test_help_lists_the_fields(file, capsys):
-    options.run(lambda config, workdir: None, argv=["--help", f"--config={file}"])
+    def main(config, workdir):
+        pass
+
+    options.run(main, flags={"out_of": "there"}, workdir="runs/here", argv=["--help", f"--config={file}"])
     text = capsys.readouterr().out
-    assert "--config.map.nested.steps=3" in text and "--workdir" in text
+    assert "--config.map.nested.steps=3" in text and "--workdir='runs/here'" in text and "--out-of='there'" in text
+    assert __doc__.splitlines()[0] in text
+    options.run(main, argv=["--help"])
+    assert "--workdir=DIRECTORY, required" in capsys.readouterr().out
 
 
 def test_a_program_ends_with_status_2(file, tmp_path):

@@ -146,6 +146,8 @@ CARD = {"config": WORLD, "scores": [{"split": "test", "seeds": SEEDS, "episodes"
         ({"score": 92.1}, False, "NOT reproduced: 92.1 DIFFERS by more than the interval from the reported 90.0 [88.0, 92.0]"),
         ({"camera": {"preset": "paper"}}, True, "which has another camera.preset ('ring' there, 'paper' here)"),
         ({"model": {"width": 4, "more": True}}, True, "which has another model.more (None there, True here)"),
+        ({"model": {"width": 4, "dtype": "float32"}}, True, "reproduced: equal"),  # the card is older than the field
+        ({"model": {"width": 4, "dtype": "bfloat16"}}, True, "which has another model.dtype ('float32' there, 'bfloat16' here)"),
         ({"seed": 1, "score": 0.0}, True, "which has another seed (0 there, 1 here)"),
         ({"eval": {"parallel": 3}}, True, "reproduced: equal"),
         ({"split": "val", "score": 0.0}, True, "which is of test seeds 10002 to 10003, not val seeds 10002 to 10003"),

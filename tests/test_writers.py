@@ -22,7 +22,7 @@ def test_scalars_reach_both_files(tmp_path):
     ]
     assert writers.read_metrics(tmp_path / "metrics.jsonl") == [json.loads(line) for line in lines]
     events = b"".join(path.read_bytes() for path in tmp_path.glob("events.out.tfevents.*"))
-    assert b"loss" in events and b"half" in events
+    assert b"loss" in events and b"half" in events and b"bad" not in events
     writer.close()  # twice is fine
 
 
@@ -64,6 +64,13 @@ def test_json(tmp_path):
         writers.write_json(path, {1, 2})
     assert json.loads(path.read_text())["d"] == 0.5
     assert [file.name for file in path.parent.iterdir()] == ["result.json"]
+
+
+def test_a_directory_that_cannot_be_written_to(tmp_path, monkeypatch):
+    assert writers.make_directory(tmp_path / "a" / "b").is_dir() and writers.make_directory(tmp_path / "a") == tmp_path / "a"
+    monkeypatch.setattr(writers.os, "access", lambda *_: False)
+    with pytest.raises(PermissionError, match="Permission denied"):
+        writers.make_directory(tmp_path / "a")
 
 
 def test_an_error_while_writing_leaves_the_old_file(tmp_path):

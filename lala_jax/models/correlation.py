@@ -20,9 +20,13 @@ def correlate(key: jax.Array, kernels: jax.Array, *, method: str = "auto") -> ja
     `out[n, i, j] = sum_abd key[i + a - c // 2, j + b - c // 2, d] * kernels[n, a, b, d]` with zeros outside the map, so
     the score of a cell is that of the kernel with its index `c // 2` on it (Transporter Networks, equation 3).
 
+    Differentiable in reverse mode; forward mode (`jax.jvp`) knows "conv" only.
+
     `method` is "fft", "conv" or "auto", the one that suits the platform. Raises ValueError for another method and for
     shapes that do not fit.
     """
+    if not key.size or not kernels.size:
+        raise ValueError(f"correlate needs at least a cell, a kernel and a channel, got {key.shape} and {kernels.shape}")
     if method not in METHODS:
         raise ValueError(f"method must be one of {METHODS}, got {method!r}")
     if key.ndim != 3 or kernels.ndim != 4 or kernels.shape[1] != kernels.shape[2] or key.shape[-1] != kernels.shape[-1]:
@@ -34,6 +38,7 @@ def correlate(key: jax.Array, kernels: jax.Array, *, method: str = "auto") -> ja
 
 def _correlate_conv(key: jax.Array, kernels: jax.Array) -> jax.Array:
     before, after = _reach(kernels.shape[1])
+    key, kernels = (one.astype(jnp.result_type(key, kernels)) for one in (key, kernels))
     out = jax.lax.conv_general_dilated(
         key[None],
         jnp.transpose(kernels, (1, 2, 3, 0)),

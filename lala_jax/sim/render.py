@@ -5,7 +5,8 @@ the tiles of pixels that its bounding box projects to, so a small object costs l
 can be clipped whatever the tile's size. A scene's fixed part is rendered once (`background`) and what moves is drawn over it
 (`render_over`). On a GPU every geom is cast on every pixel instead, which fuses into one kernel.
 
-All functions are written for one scene; `jax.vmap` over scenes keeps the loop over tiles in place.
+All functions are written for one scene; `jax.vmap` over scenes keeps the loop over tiles in place. Of
+derivatives they know forward mode (`jax.jvp`) only.
 """
 
 from __future__ import annotations

@@ -114,11 +114,22 @@ def test_bfloat16_goes_in_and_float32_comes_out(method):
     np.testing.assert_allclose(out, want, atol=0.02 * np.abs(want).max())
 
 
+@pytest.mark.parametrize("method", BOTH)
+def test_types_may_differ(method):
+    key, kernels = map(jnp.asarray, _inputs(4))
+    mixed = correlation.correlate(key.astype(jnp.bfloat16), kernels, method=method)
+    np.testing.assert_allclose(
+        mixed, correlation.correlate(key.astype(jnp.bfloat16).astype(jnp.float32), kernels, method=method), atol=1e-4
+    )
+
+
 def test_refuses_what_it_cannot_do():
     key, kernels = _inputs(5)
     with pytest.raises(ValueError, match=r"method must be one of \('auto', 'fft', 'conv'\), got 'direct'"):
         correlation.correlate(key, kernels, method="direct")
     with pytest.raises(ValueError, match=r"got \(9, 6, 3\) and \(2, 4, 4, 2\)"):
         correlation.correlate(key, kernels[..., :2])
+    with pytest.raises(ValueError, match=r"at least a cell, a kernel and a channel, got \(9, 6, 3\) and \(0, 4, 4, 3\)"):
+        correlation.correlate(key, kernels[:0])
     with pytest.raises(ValueError, match="correlate needs key"):
         correlation.correlate(key, kernels[:, :3])
