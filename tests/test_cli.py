@@ -105,6 +105,13 @@ def test_evaluation_of_a_checkpoint_through_other_cameras(trained, call, tmp_pat
     assert (tmp_path / "episode-test-0.webp").exists()
 
 
+def test_weights_of_another_task_are_told(trained, call, tmp_path):
+    where = [f"--checkpoint={trained[1] / 'checkpoints'}", f"--workdir={tmp_path}", "--episodes=1"]
+    answer = call("lala_jax.evaluate", *where, "--config.task.name=pallet", "--config.task.num_objects=0")
+    assert answer.status == 0 and "checkpoints was trained on tower, this is pallet" in answer.out
+    assert ", first to go wrong: 1 " in answer.out and "[nan" not in answer.out
+
+
 def test_the_oracle_needs_no_checkpoint(trained, call, tmp_path):
     answer = call("lala_jax.evaluate", "--agent=oracle", f"--workdir={tmp_path}", *tiny(trained[0]))
     assert answer.status == 0 and json.loads((tmp_path / "scores-oracle-val.json").read_text())["score"] == 100
@@ -116,7 +123,8 @@ def test_collection_goes_on_where_it_stopped(trained, call, tmp_path):
     before = contents(tmp_path / "data")
     answer = call("lala_jax.collect", *tiny(tmp_path / "data", "data.demos=1"))
     assert answer.status == 0 and contents(tmp_path / "data") == before and str(tmp_path / "data") in answer.out
-    assert call("lala_jax.collect", *tiny(tmp_path / "data", "data.demos=3")).status == 0
+    answer = call("lala_jax.collect", *tiny(tmp_path / "data", "data.demos=3"))
+    assert answer.status == 0 and f"{tmp_path / 'data'} holds 2 demonstrations: recording 1 more in simulation" in answer.out
     assert before.items() < contents(tmp_path / "data").items()
     np.testing.assert_array_equal(dataset.seeds(tmp_path / "data"), [0, 2, 4])
 
