@@ -1,9 +1,10 @@
 """Score a policy in closed loop: `python -m lala_jax.evaluate --checkpoint=runs/tower/checkpoints --split=test --episodes=100`.
 
-The config comes from the checkpoint; `--config.camera.preset=paper` and the like change it. `--checkpoint=pretrained/tower` repeats the
-reported score of the weights that ship with the package, and ends with status 1 where it comes out outside the reported interval. The
-agents that need no training are scored with `--config=configs/tower.py --agent=oracle`, `blind` or `top_view`. With `--launcher=slurm` or
-`local` workers score the episodes in parts (see `cluster`).
+The config comes from the checkpoint; `--config.camera.preset=paper` and the like change it. Of `--split`, `--start` and `--episodes` what
+is not given (-1) is the config's. `--checkpoint=pretrained/tower` repeats the reported score of the weights that ship with the package,
+and ends with status 1 where it comes out outside the reported interval. The agents that need no training are scored with
+`--config=configs/tower.py --agent=oracle`, `blind` or `top_view`. With `--launcher=slurm` or `local` workers score the episodes in
+parts (see `cluster`).
 """
 
 from __future__ import annotations
