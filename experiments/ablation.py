@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import json
 import pathlib
 from collections.abc import Sequence
 from typing import Any
@@ -74,19 +73,18 @@ def main(
     launch = cluster.launcher(launcher, launcher_options)
     base = budget(config, steps=steps, demos=demos, start=start, episodes=episodes, seed=seed)
     seeds, runs = build.split_seeds("val", start, episodes), pathlib.Path(build.workdir(config, workdir))
-    chosen = common.choose(ROWS, rows, task)
+    chosen, spent = common.choose(ROWS, rows, task), {"steps": steps, "demos": demos, "seed": seed}
 
     def finish(done: Sequence[dict[str, Any]], kept: Sequence[dict[str, Any]]) -> dict[str, Any]:
         del kept
         for row in done[1:] if done[0]["name"] == chosen[0].name else ():
             row["difference"] = common.difference(row["scores"], done[0]["scores"], paired=True)
-        return {"task": task, "split": "val", "steps": steps, "demos": demos, "seed": seed, "reference": chosen[0].name}
+        return {"task": task, "split": "val", **spent, "reference": chosen[0].name}
 
     path = pathlib.Path(out) / f"ablation-{task}.json"
-    if common.read(path):
-        held, asked = json.loads(path.read_text()), {"--steps": steps, "--demos": demos, "--seed": seed}
-        if other := [f"{flag}={held[flag[2:]]}" for flag, value in asked.items() if held[flag[2:]] != value]:
-            raise options.OptionsError(f"{path} holds rows of {' '.join(other)}: give another --out")
+    held, _ = common.read_whole(path)
+    if other := [f"--{name}={held[name]}" for name, value in spent.items() if held and held[name] != value]:
+        raise options.OptionsError(f"{path} holds rows of {' '.join(other)}: give another --out")
     work, before = functools.partial(run, base=base, runs=runs, seeds=seeds), common.recordings([row for row in chosen if row.trains], base)
     done = common.fill(path, chosen, work, finish, config=base, seeds=seeds, launch=launch, before=before)
     print(f"\n{table(done)}\n\n{path}")

@@ -177,8 +177,16 @@ def _is_old(stored: Mapping[str, Any], known: Sequence[Row]) -> bool:
 
 def read(path: pathlib.Path) -> dict[str, dict[str, Any]]:
     """Read the rows of a file by name; none where there is no file. Raises OptionsError where it is something else."""
+    return read_whole(path)[1]
+
+
+def read_whole(path: pathlib.Path) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
+    """Read a file's own fields and its rows by name; as `read`."""
+    if not path.exists():
+        return {}, {}
     try:
-        return {row["name"]: row for row in json.loads(path.read_text())["rows"]} if path.exists() else {}
+        whole = json.loads(path.read_text())
+        return whole, {row["name"]: row for row in whole["rows"]}
     except (ValueError, KeyError, TypeError) as error:
         text = f"{path} is damaged or no file of rows ({type(error).__name__} {error}): move it away, or give another --out"
         raise options.OptionsError(text) from error
@@ -290,18 +298,11 @@ def difference(scores: Mapping[str, float], reference: Mapping[str, float], *, p
 # Tables
 
 
-def with_interval(value: float, interval: Sequence[float | None], *, signed: bool = False) -> str:
-    """Write `81.2 [75.0, 87.4]`; an interval of too few episodes is left out."""
-    form = "{:+.1f}" if signed else "{:.1f}"
-    low, high = (math.nan if end is None else end for end in interval)
-    return form.format(value) + ("" if math.isnan(low) else f" [{form.format(low)}, {form.format(high)}]")
-
-
 def cells(row: Mapping[str, Any], against: str = "") -> list[str]:
     """Write a row's label, score and complete rate, and where `against` names it the field that compares it with the first row."""
-    found = [row["label"], with_interval(row["score"], row["interval95"]), f"{row['complete_percent']:.0f}%"]
+    found = [row["label"], rollout.with_interval(row["score"], row["interval95"]), f"{row['complete_percent']:.0f}%"]
     if against:
-        found.append(with_interval(row[against]["mean"], row[against]["interval95"], signed=True) if against in row else "")
+        found.append(rollout.with_interval(row[against]["mean"], row[against]["interval95"], signed=True) if against in row else "")
     return found
 
 

@@ -109,13 +109,8 @@ def _wanted(task: base.Task, seed: int):
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
     """Write the rows as a Markdown table."""
-    lines = [[*common.cells(row, "drop"), counted(row["first_failures"])] for row in rows]
+    lines = [[*common.cells(row, "drop"), rollout.counted(row["first_failures"])] for row in rows]
     return common.table(["world", "score", "complete", "drop", "first to go wrong, episodes"], lines)
-
-
-def counted(counts: Mapping[str, int]) -> str:
-    """Write the counts that are not 0, the largest first: `3 wrong yaw, 1 missed pick`."""
-    return ", ".join(f"{n} {name}" for name, n in sorted(counts.items(), key=lambda item: -item[1]) if n)
 
 
 def stored_config(flags):

@@ -54,9 +54,8 @@ def task(config: Mapping[str, Any]) -> base.Task:
     options.check_choice("task.name", fields["name"], tasks.names())
     options.check_choice("task.colors", fields["colors"], base.COLOR_CHOICES)
     number = {"num_objects": fields["num_objects"]} if fields["num_objects"] else {}
-    distractors = fields.get("distractors", 0)  # configs in checkpoints may be older than the field
     try:
-        return tasks.get(fields["name"], colors=fields["colors"], distractors=distractors, **number)
+        return tasks.get(fields["name"], colors=fields["colors"], distractors=_newer(config, "task.distractors"), **number)
     except (ValueError, TypeError) as error:
         raise options.OptionsError(str(error)) from error
 
@@ -75,7 +74,7 @@ def data_identity(config: Mapping[str, Any]) -> dict[str, Any]:
 
 def mistakes(config: Mapping[str, Any]) -> float:
     """Give the share of the demonstrations' actions that are spoiled."""
-    share = config["data"].get("mistakes", 0.0)  # configs in checkpoints may be older than the field
+    share = _newer(config, "data.mistakes")
     if not 0.0 <= share < 1.0:
         raise options.OptionsError(f"config field data.mistakes must be at least 0 and below 1, got {share!r}")
     return share
@@ -100,19 +99,16 @@ def observer(config: Mapping[str, Any]) -> observe.Observer:
     surface(config)
     built = observe.Observer(task=task(config), spec=map_spec(config), dtype=network_dtype(config), **fields)
     try:
-        count = len(built.camera.intrinsics)
-        options.check_choice("camera.missing", built.missing, range(-1, count))
         built.check()
-    except options.OptionsError:
-        raise
     except ValueError as error:
         raise options.OptionsError(f"camera.preset {built.preset!r}: {error}") from error
+    options.check_choice("camera.missing", built.missing, range(-1, len(built.camera.intrinsics)))
     return built
 
 
 def surface(config: Mapping[str, Any]) -> int:
     """Give the number of pretrained features that the map's surface has; 0 without a backbone."""
-    name, stage = (config["camera"].get(field, "") for field in ("backbone", "stage"))  # configs in checkpoints may be older
+    name, stage = (_newer(config, field) for field in ("camera.backbone", "camera.stage"))
     if not name:
         return 0
     options.check_choice("camera.stage", stage, resnet.STAGES)
@@ -130,7 +126,7 @@ def backbone_identity(config: Mapping[str, Any]) -> dict[str, str]:
 
 def network_dtype(config: Mapping[str, Any]) -> str:
     """Give the type that networks compute in, the backbone among them."""
-    return options.check_choice("model.dtype", config["model"].get("dtype", defaults.NEWER["model.dtype"]), DTYPES)
+    return options.check_choice("model.dtype", _newer(config, "model.dtype"), DTYPES)
 
 
 def build_policy(config: Mapping[str, Any]) -> policy.Policy:
@@ -176,7 +172,7 @@ def build_policy(config: Mapping[str, Any]) -> policy.Policy:
 def clip_files(config: Mapping[str, Any]) -> dict[str, Any]:
     """Give CLIP's `weights`, its `tokenizer` and how many `stages` of its trunk cliport takes, where the config names its files."""
     fields = config["model"]
-    weights, tokenizer, stages = (fields.get(name, defaults.NEWER[f"model.{name}"]) for name in ("clip", "clip_tokenizer", "clip_stages"))
+    weights, tokenizer, stages = (_newer(config, f"model.{name}") for name in ("clip", "clip_tokenizer", "clip_stages"))
     if not (weights or tokenizer or stages):
         return {}
     if fields["name"] != "cliport":
@@ -196,7 +192,7 @@ def clip_identity(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _mix(config: Mapping[str, Any]) -> float:
-    return _share("augment.mix", config["augment"].get("mix", defaults.NEWER["augment.mix"]))
+    return _share("augment.mix", _newer(config, "augment.mix"))
 
 
 def _check_names(config: Mapping[str, Any]) -> None:
@@ -284,7 +280,7 @@ def on_devices(recipe: Recipe, config: Mapping[str, Any], *, group: str) -> Reci
     mesh = parallel.mesh(f"{group}.batch_size", recipe.batch_size)
     if mesh is None:
         return recipe
-    return dataclasses.replace(recipe, mesh=mesh, shard_state=config["train"].get("shard_state", False))  # configs may be older
+    return dataclasses.replace(recipe, mesh=mesh, shard_state=_newer(config, "train.shard_state"))
 
 
 def pretrain_recipe(config: Mapping[str, Any]) -> pretrain_step.Recipe:
@@ -332,7 +328,7 @@ def run_settings(config: Mapping[str, Any]) -> dict[str, Any]:
     """
     free = ("pretrain.", "eval.", "data.directory", "data.threads")
     free += ("train.log_every", "train.save_every", "train.eval_every", "train.eval_episodes", "train.shard_state")
-    return {name: value for name, value in (defaults.NEWER | options.fields(config)).items() if not name.startswith(free)}
+    return {name: value for name, value in options.fields(defaults.complete(config)).items() if not name.startswith(free)}
 
 
 def input_spec(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -359,6 +355,12 @@ def split_seeds(split: str, start: int, count: int) -> list[int]:
         most = math.ceil((TEST_START - 1) / 2)
         raise options.OptionsError(f"the {split} split has {most} seeds, asked for {start}..{start + count - 1}")
     return seeds
+
+
+def _newer(config: Mapping[str, Any], name: str) -> Any:
+    """Read a field that configs in checkpoints may be older than."""
+    group, field = name.split(".")
+    return config[group].get(field, defaults.NEWER[name])
 
 
 def _positive(name: str, value: float) -> None:

@@ -202,14 +202,18 @@ def _candidates(path: pathlib.Path, which: str) -> list[tuple[pathlib.Path, int]
     folders = [path / which, path / ("latest" if which == "best" else "best")]
     found = [(folder, step) for folder in folders for step in _steps(folder)]
     if not found:
-        below, above = path / "checkpoints", path.parent if path.name in ("best", "latest") else path.parent.parent
-        near = next((folder for folder in (below, above) if any(_steps(folder / one) for one in ("best", "latest"))), None)
-        there = [str(folder / str(step)) for folder in (near / "best", near / "latest") for step in _steps(folder)] if near else []
-        hint = f"; did you mean {near}, or one of its steps, {', '.join(there)}?" if near else ""
-        raise CheckpointError(f"no checkpoint at {path}: looked for steps in {folders[0]} and {folders[1]}{hint}")
+        raise CheckpointError(f"no checkpoint at {path}: looked for steps in {folders[0]} and {folders[1]}{_near(path)}")
     if found[0][0] != folders[0]:
         _LOG.warning("%s holds no step, taking %s", folders[0], folders[1])
     return found
+
+
+def _near(path: pathlib.Path) -> str:
+    """Name the checkpoints below or above a path that is none; "" where there are none."""
+    for folder in (path / "checkpoints", path.parent, path.parent.parent):
+        if there := [str(folder / kind / str(step)) for kind in ("best", "latest") for step in _steps(folder / kind)]:
+            return f"; did you mean {folder}, or one of its steps, {', '.join(there)}?"
+    return ""
 
 
 def named(tree: Any) -> dict[str, Any]:

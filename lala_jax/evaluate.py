@@ -51,8 +51,6 @@ def score(config, checkpoint: str, agent: str, seeds: Sequence[int], launch: clu
             raise options.OptionsError(NO_CHECKPOINT)
         built, observer = build.build_policy(config), build.observer(config)
         params = scoring.check_checkpoint(checkpoint, config, built)
-        if (trained := pretrained.describe(checkpoint)["config"]["task"]["name"]) != config.task.name:
-            print(f"{checkpoint} was trained on {trained}, this is {config.task.name}", flush=True)
         weights = pretrained.fingerprint(checkpoint, params)
         if launch is None:
             result, strips = scoring.evaluate(

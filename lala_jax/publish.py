@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from lala_jax import build, checkpoint, encoders, options, pretrained, state, writers
+from lala_jax import build, checkpoint, encoders, options, pretrained, rollout, state, writers
 
 LARGEST = 12_000_000  # bytes of weights.npz
 LICENCE = "Apache-2.0"
@@ -297,8 +297,7 @@ def _other_worlds(table: Mapping[str, Any] | None) -> list[str]:
 
 
 def _score(row: Mapping[str, Any]) -> str:
-    low, high = row["interval95"]
-    return f"{row['score']:.1f} [{low:.1f}, {high:.1f}] | {row['complete_percent']:.0f}%"
+    return f"{rollout.with_interval(row['score'], row['interval95'])} | {row['complete_percent']:.0f}%"
 
 
 if __name__ == "__main__":

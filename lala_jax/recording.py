@@ -46,7 +46,7 @@ def _complete(config, directory: pathlib.Path, identity: Mapping[str, Any], *, q
     done, wanted = dataset.seeds(directory), config["data"]["demos"]
     kept, place = len(done), (int(done.max()) // 2 + 1 if done.size else 0)
     plan(place, wanted - kept)  # raises now, not after hours, where there are not so many seeds
-    if kept and not quiet:
+    if 0 < kept < wanted and not quiet:
         print(f"{directory} holds {kept} demonstrations: recording {wanted - kept} more in simulation", flush=True)
     columns = (*progress.Progress.get_default_columns(), progress.MofNCompleteColumn())
     with progress.Progress(*columns, disable=quiet or launch is not None) as bar:

@@ -164,6 +164,18 @@ def interval(scores: Sequence[float] | np.ndarray) -> list[float]:
     return [max(mean - down, 0.0), min(mean + up, 100.0)]
 
 
+def with_interval(value: float, interval: Sequence[float | None], *, signed: bool = False) -> str:
+    """Write `81.2 [75.0, 87.4]`; an interval of too few episodes is left out."""
+    form = "{:+.1f}" if signed else "{:.1f}"
+    low, high = (math.nan if end is None else end for end in interval)
+    return form.format(value) + ("" if math.isnan(low) else f" [{form.format(low)}, {form.format(high)}]")
+
+
+def counted(counts: Mapping[str, int]) -> str:
+    """Write the counts that are not 0, the largest first: `3 wrong yaw, 1 missed pick`."""
+    return ", ".join(f"{n} {name}" for name, n in sorted(counts.items(), key=lambda item: -item[1]) if n)
+
+
 def head(lines: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Sum up the lines of episodes (a summary's `per_episode`): mean score with a 95% interval, complete rate, number of actions."""
     scores = np.array([line["score"] for line in lines])

@@ -223,13 +223,18 @@ def _views(observer, size, color, base, poses, layer):
 
 
 def check_checkpoint(path: str, config: Mapping[str, Any], agent: policy.Policy) -> Any:
-    """Load the averaged parameters of a checkpoint or of published weights, checked against the policy that the config describes."""
+    """Load the averaged parameters of a checkpoint or of published weights, checked against the policy that the config describes.
+
+    Says so where they were trained on another task.
+    """
     template = jax.eval_shape(agent.init, jax.random.key(0))
-    params, _, spec = pretrained.load(path)
+    params, trained, spec = pretrained.load(path)
     expected = build.input_spec(config)
     if writers.plain(spec) != writers.plain(expected):
         raise checkpoint.MismatchError(f"{path} expects the input {spec}, the config makes {expected}")
     _check_shapes(path, params, template)
+    if (there := trained["task"]["name"]) != (here := config["task"]["name"]):
+        print(f"{path} was trained on {there}, this is {here}", flush=True)
     return jax.tree.map(jnp.asarray, params)
 
 
@@ -258,11 +263,10 @@ def write_scores(
     facts = {"agent": agent, "task": config.task.name, "split": split, "seeds": [seeds[0], seeds[-1]]}
     facts |= {"checkpoint": source, "weights": weights}
     writers.write_json(path, {**facts, "device": jax.devices()[0].device_kind, **result, "config": options.to_dict(config)})
-    low, high = result["interval95"]
-    reach = "" if np.isnan(low) else f" [{low:.1f}, {high:.1f}]"
-    wrong = ", ".join(f"{count} {cause}" for cause, count in result["first_failures"].items() if count and cause != "none")
+    score = rollout.with_interval(result["score"], result["interval95"])
+    wrong = rollout.counted({cause: count for cause, count in result["first_failures"].items() if cause != "none"})
     print(
-        f"{config.task.name} {agent}, {split} split, {result['episodes']} episodes: score {result['score']:.1f}{reach}, "
+        f"{config.task.name} {agent}, {split} split, {result['episodes']} episodes: score {score}, "
         f"complete {result['complete_percent']:.0f}%{f', first to go wrong: {wrong}' if wrong else ''}; {path}",
         flush=True,
     )

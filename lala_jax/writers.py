@@ -157,9 +157,8 @@ class Writer:
         self._file.flush()
         if self._board is not None:
             for name in values:
-                if not math.isfinite(record[name]):  # undefined here, or a gap in the curve
-                    continue
-                self._board.add_scalar(name, record[name], int(step))
+                if math.isfinite(record[name]):  # else undefined here: a gap in the curve
+                    self._board.add_scalar(name, record[name], int(step))
 
     def close(self) -> None:
         """Flush to disk and close; closing twice does nothing."""

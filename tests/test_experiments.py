@@ -285,10 +285,10 @@ def test_training_seconds_are_those_of_the_curve(tmp_path):
 
 
 def test_tables():
-    text = common.table(["", "score"], [["a", common.with_interval(50, [40.04, 60])], ["b", common.with_interval(1, [None, None])]])
+    text = common.table(["", "score"], [["a", rollout.with_interval(50, [40.04, 60])], ["b", rollout.with_interval(1, [None, None])]])
     assert text.splitlines() == ["|  | score |", "| --- | --- |", "| a | 50.0 [40.0, 60.0] |", "| b | 1.0 |"]
-    assert common.with_interval(-2, [-3, 1], signed=True) == "-2.0 [-3.0, +1.0]"
-    assert robustness.counted({"wrong yaw": 1, "wrong place": 3, "none": 0}) == "3 wrong place, 1 wrong yaw"
+    assert rollout.with_interval(-2, [-3, 1], signed=True) == "-2.0 [-3.0, +1.0]"
+    assert rollout.counted({"wrong yaw": 1, "wrong place": 3, "none": 0}) == "3 wrong place, 1 wrong yaw"
 
 
 # Whole series

@@ -8,8 +8,7 @@ import re
 
 import pytest
 
-from experiments import common
-from lala_jax import defaults, options
+from lala_jax import defaults, options, rollout
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "experiments" / "results"
@@ -43,7 +42,7 @@ def test_scores_are_those_of_the_files(file):
     found = json.loads((RESULTS / file).read_text())
     text = section("Results").replace("*", "")
     for row in found.get("rows", [found]):
-        assert f"{common.with_interval(row['score'], row['interval95'])} |" in text
+        assert f"{rollout.with_interval(row['score'], row['interval95'])} |" in text
 
 
 def test_the_table_of_rivals_is_the_one_that_was_written():

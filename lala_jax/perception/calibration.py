@@ -57,7 +57,7 @@ def calibrate(
     size = (camera.intrinsics.shape[0], camera.height, camera.width)
     if depth.shape != size:
         raise ValueError(f"calibrate needs depth of its cameras' shape {size}, got {depth.shape}; vmap over scenes")
-    pinhole.check_floating(depth=(depth, "metres"))
+    pinhole.check_floating("depth", depth, "metres")
     depth = jnp.where(jnp.isfinite(depth) & (depth > 0), depth, 0.0)
 
     def one(depth, camera):

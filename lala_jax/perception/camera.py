@@ -15,11 +15,10 @@ from lala_jax import types
 from lala_jax.perception import transforms
 
 
-def check_floating(**leaves: tuple[jax.Array, str]) -> None:
-    """Raise ValueError where pixels `name=(array, unit)` are whole numbers, of 0..255 or millimetres."""
-    for name, (leaf, unit) in leaves.items():
-        if not jnp.issubdtype(leaf.dtype, jnp.floating):
-            raise ValueError(f"{name} must be floating point, {unit}, got {leaf.dtype}")
+def check_floating(name: str, pixels: jax.Array, unit: str) -> None:
+    """Raise ValueError where pixels are whole numbers, of 0..255 or millimetres."""
+    if not jnp.issubdtype(pixels.dtype, jnp.floating):
+        raise ValueError(f"{name} must be floating point, {unit}, got {pixels.dtype}")
 
 
 def intrinsics(height: int, width: int, *, focal: float) -> Float[Array, "3 3"]:

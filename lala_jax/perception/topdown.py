@@ -86,8 +86,9 @@ def from_views(
     Raises ValueError for whole numbers and for shapes that do not fit. Of wrong units, inverted poses or OpenGL's camera axes it knows
     nothing: the map is then empty (`count` is 0).
     """
-    cameras.check_floating(**{"views.rgb": (views.rgb, "in 0..1"), "views.depth": (views.depth, "metres")})
-    check_shapes(views)
+    cameras.check_floating("views.rgb", views.rgb, "in 0..1")
+    cameras.check_floating("views.depth", views.depth, "metres")
+    _check_shapes(views)
     points = jax.vmap(cameras.unproject)(views.depth, views.camera)
     values = views.rgb if features is None else jnp.concatenate([views.rgb, features], axis=-1)
     return fuse(
@@ -100,7 +101,7 @@ def from_views(
     )
 
 
-def check_shapes(views: types.Views) -> None:
+def _check_shapes(views: types.Views) -> None:
     """Raise ValueError, naming the field, where the leaves of V views do not fit each other."""
     count, camera = len(views.depth), views.camera
     shapes = {"depth": (count, camera.height, camera.width), "rgb": (count, camera.height, camera.width, 3)}

@@ -150,6 +150,8 @@ class Task:
         if self.colors not in COLOR_CHOICES:
             raise ValueError(f"task {self.name}: colors={self.colors!r} is not one of {sorted(COLOR_CHOICES)}")
         most = len(PALETTES.get(self.colors, COLORS)) - self.num_objects
+        if not all(0.0 <= value <= 1.0 for value in self.base_color):
+            raise ValueError(f"task {self.name}: base_color must be RGB in 0..1, got {self.base_color}")
         if self.num_objects < 1:
             raise ValueError(f"task {self.name}: num_objects={self.num_objects} must be at least 1")
         if self.distractors and type(self).build_distractors is Task.build_distractors:
@@ -220,8 +222,6 @@ class Task:
         for name in ("base", "start", "goal"):
             if (tilt := np.abs(getattr(scene, name)[..., 4:6]).max()) > 1e-3:
                 raise ValueError(f"task {self.name}: a scene's {name} must stand upright, turned about z alone, got qx or qy of {tilt:.4g}")
-        if not all(0.0 <= value <= 1.0 for value in self.base_color):
-            raise ValueError(f"task {self.name}: base_color must be RGB in 0..1, got {self.base_color}")
         if (lowest := scene.size[:, 2].min()) < LOWEST - 1e-6:
             raise ValueError(f"task {self.name}: objects must be at least {LOWEST} m high, or the score mixes up levels, got {lowest:.4f}")
 
