@@ -19,7 +19,7 @@ import optax
 
 from experiments import timing
 from experiments.benchmark_targets import EPISODES
-from lala_jax import build, checkpoint, compiling, losses, options, policy, recording, rollout, scoring, state, train_step, types
+from lala_jax import build, checkpoint, compiling, losses, options, policy, recording, rollout, scoring, state, train, train_step, types
 from lala_jax.models import correlation, transporter
 from lala_jax.perception import topdown
 from lala_jax.sim import oracle, physics, render, robot, scene
@@ -125,7 +125,7 @@ def features(config) -> timing.Work:
 def act(config) -> timing.Work:
     """Let the policy act on one pair of maps."""
     agent = build.build_policy(config)
-    params = jax.jit(agent.init)(jax.random.key(0, impl="rbg"))
+    params = compiling.step_by_step(agent.init, jax.random.key(0, impl="rbg"))
     blank = policy.empty_map(agent.spec)
     return timing.compiled(agent.act, params, blank, blank)
 
@@ -161,9 +161,8 @@ def unstacked(drawn: types.Scene) -> list[types.Scene]:
 def training_step(config) -> timing.Work:
     """Take training steps: draw, augment, render, fuse, loss, gradient, update."""
     recipe, states, key = build.recipe(config), states_of(config, BATCH), jax.random.key(0)
-    fresh = jax.jit(lambda key: state.create(recipe.policy.init(key), recipe.optimizer))(jax.random.key(0, impl="rbg"))
     step = compiling.jit(functools.partial(train_step.train_step, recipe), donate_argnums=0)
-    return timing.stepping(step, fresh, states, key, recipe.policy.frozen, count=recipe.batch_size)
+    return timing.stepping(step, train.fresh(recipe, 0), states, key, recipe.policy.frozen, count=recipe.batch_size)
 
 
 def paper_step(config, **fields) -> timing.Work:
@@ -189,11 +188,6 @@ def paper_losses(net: transporter.Transporter, params: Any, example: dict[str, A
     return losses.masked_cross_entropy(logits["pick"], at) + place, logits
 
 
-def drawn_leaf(rng: np.random.Generator, leaf: jax.ShapeDtypeStruct) -> jax.Array:
-    """Draw a kernel that keeps the size of what goes through it, or a bias; without the minute that it takes to compile `init`."""
-    return jnp.asarray(rng.normal(size=leaf.shape) * np.prod(leaf.shape[:-1]) ** -0.5, jnp.float32)
-
-
 def paper_network(config, *, rows: int = 320, cols: int = 160, batch: int = 1, **sizes) -> timing.Work:
     """Take plain steps of the paper's two-stream network on given maps, `batch` examples at a time: loss, gradient, Adam."""
     del config
@@ -210,8 +204,8 @@ def paper_network(config, *, rows: int = 320, cols: int = 160, batch: int = 1, *
         updates, moments = optimizer.update(grads, moments)
         return (optax.apply_updates(params, updates), moments), {name: leaf.max() for name, leaf in logits.items()}
 
-    shapes = jax.eval_shape(lambda key: net.init(key, example["current"], example["goal"], example["pick"])["params"], jax.random.key(0))
-    params = jax.tree.map(functools.partial(drawn_leaf, np.random.default_rng(0)), shapes)
+    key = jax.random.key(0, impl="rbg")
+    params = compiling.step_by_step(net.init, key, example["current"], example["goal"], example["pick"])["params"]
     examples = jax.tree.map(lambda leaf: jnp.stack([leaf] * batch), example)
     return timing.stepping(compiling.jit(step, donate_argnums=0), (params, optimizer.init(params)), examples, count=batch)
 
@@ -283,9 +277,7 @@ def evaluation(config) -> timing.Work:
 
 def trained_state(config) -> tuple[state.TrainState, dict[str, Any]]:
     """Make a fresh training state, and what is stored beside it."""
-    recipe = build.recipe(config)
-    fresh = jax.jit(lambda key: state.create(recipe.policy.init(key), recipe.optimizer))(jax.random.key(0, impl="rbg"))
-    return fresh, {"config": options.to_dict(config), "input_spec": build.input_spec(config)}
+    return train.fresh(build.recipe(config), 0), {"config": options.to_dict(config), "input_spec": build.input_spec(config)}
 
 
 def save(config) -> timing.Work:

@@ -10,11 +10,12 @@ import tempfile
 import jax
 
 from experiments import benchmark_stages
-from lala_jax import build, checkpoint, loop, options, train
+from lala_jax import build, checkpoint, compiling, loop, options, train
 
 
 def main() -> None:
     """Do what training does up to its first step, with states that are drawn here instead of recorded ones."""
+    compiling.keep()
     config = options.from_dict(json.load(sys.stdin))
     recipe, states = build.recipe(config), benchmark_stages.states_of(config, benchmark_stages.BATCH)
     with tempfile.TemporaryDirectory() as folder:

@@ -9,10 +9,12 @@ import os
 import pathlib
 import sys
 import time
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import numpy as np
+from jax.extend import core
 from jax.interpreters import partial_eval
 
 # On a CPU, XLA hands convolutions and what is around them to a library, YNN. The kernel gradient of a 3x3 convolution of 24 channels
@@ -24,6 +26,7 @@ OPTIONS = {"xla_cpu_experimental_ynn_fusion_type": ""}
 LEAN = {"xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"}
 LARGE = 2 << 30  # bytes
 
+_MIN_SECONDS = "jax_persistent_cache_min_compile_time_secs"  # JAX's setting: what took less to compile is not kept
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8  # of glibc's malloc.h
 
 jit = functools.partial(jax.jit, compiler_options=OPTIONS)
@@ -49,6 +52,18 @@ def build(jitted, *arguments: Any) -> tuple[Any, dict[str, float]]:
     moved = (program.cost_analysis() or {}).get("bytes accessed", 0)
     counts = {"flops": flops(traced.jaxpr), "bytes": moved, "memory": memory_of(program)}
     return program, facts | {name: float(count) for name, count in counts.items() if count > 0}
+
+
+def step_by_step(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Call a function of arrays operation by operation, only those that its results need, each kind of each shape compiled once.
+
+    For what runs once and does one thing over and over, such as drawing parameters: a jitted `init` compiles every draw anew. What is
+    jitted within `function` stays one operation.
+    """
+    traced, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
+    needed, _ = partial_eval.dce_jaxpr(traced.jaxpr, [True] * len(traced.jaxpr.outvars), instantiate=True)
+    results = core.jaxpr_as_fun(core.ClosedJaxpr(needed, traced.consts))(*jax.tree.leaves(arguments))
+    return jax.tree.unflatten(jax.tree.structure(shapes), results)
 
 
 def memory_of(program) -> float:
@@ -144,14 +159,19 @@ def _glibc(name: str, *arguments: int) -> None:
 def keep_programs() -> None:
     """Keep compiled programs in the user's cache folder, for processes to come: their first training step is there in a third of the time.
 
-    JAX_COMPILATION_CACHE_DIR names another folder, JAX_ENABLE_COMPILATION_CACHE=false keeps nothing. The folder may be deleted.
+    Small ones, too, of which a start compiles dozens. JAX_COMPILATION_CACHE_DIR names another folder,
+    JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS what is too quick to be kept, JAX_ENABLE_COMPILATION_CACHE=false keeps nothing. The
+    folder may be deleted.
     """
-    if jax.config.jax_compilation_cache_dir is not None or not jax.config.jax_enable_compilation_cache:
+    if not jax.config.jax_enable_compilation_cache:
         return
-    folder = pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache") / "lala_jax" / "xla"
-    try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)  # what lies there is run
-    except OSError as error:
-        print(f"compiled programs are not kept: {error}", file=sys.stderr)
-        return
-    jax.config.update("jax_compilation_cache_dir", str(folder))
+    if jax.config.jax_compilation_cache_dir is None:
+        folder = pathlib.Path(os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache") / "lala_jax" / "xla"
+        try:
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)  # what lies there is run
+        except OSError as error:
+            print(f"compiled programs are not kept: {error}", file=sys.stderr)
+            return
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+    if _MIN_SECONDS.upper() not in os.environ:
+        jax.config.update(_MIN_SECONDS, 0.0)

@@ -18,11 +18,12 @@ import numpy as np
 def atomic(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     """Open a file that takes the name `path` only after the block ended without an error and its bytes are on disk.
 
-    Written under `path` + `.tmp` and renamed; parents are made. One writer per path.
+    Written under a name of this process that ends in `.tmp`, and renamed; parents are made. Of several processes that write one path the
+    last one's file stays, whole; within a process there must be one writer per path.
     """
     path = pathlib.Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".tmp")
+    temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
     try:
         with open(temporary, "wb") as file:
             yield file

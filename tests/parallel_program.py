@@ -17,7 +17,7 @@ import optax
 import test_train_step
 from jax.sharding import Mesh, PartitionSpec
 
-from lala_jax import build, checkpoint, loop, options, parallel, state, train
+from lala_jax import build, checkpoint, loop, options, parallel, train
 
 CONFIG = options.from_dict({"rate": 0.1})
 STORED = {"config": options.to_dict(CONFIG), "input_spec": {}}
@@ -56,8 +56,7 @@ def agent(batch_size):
 
 def start(recipe):
     """A fresh state, where the recipe says."""
-    fresh = jax.jit(lambda key: state.create(recipe.policy.init(key), recipe.optimizer))(jax.random.key(0, impl="rbg"))
-    return parallel.place(fresh, recipe.mesh, shard=recipe.shard_state)
+    return parallel.place(train.fresh(recipe, 0), recipe.mesh, shard=recipe.shard_state)
 
 
 def advance(recipe, steps=3):

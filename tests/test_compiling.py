@@ -7,12 +7,15 @@ import sys
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
+from flax import linen as nn
 
+from experiments import timing
 from lala_jax import compiling
 from lala_jax.models import convolution
 
-FIELDS = ("jax_compilation_cache_dir", "jax_enable_compilation_cache")
+FIELDS = ("jax_compilation_cache_dir", "jax_enable_compilation_cache", "jax_persistent_cache_min_compile_time_secs")
 
 
 @pytest.fixture
@@ -20,7 +23,9 @@ def settings(monkeypatch, tmp_path):
     """JAX's settings as a user has them who set none, in a home of their own; restored afterwards."""
     before = {name: getattr(jax.config, name) for name in FIELDS}
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.delenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS")
     jax.config.update("jax_compilation_cache_dir", None)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 5.0)
     yield jax.config
     for name, value in before.items():
         jax.config.update(name, value)
@@ -30,16 +35,24 @@ def test_programs_are_kept_in_the_users_cache(settings, tmp_path):
     compiling.keep_programs()
     folder = tmp_path / "lala_jax" / "xla"
     assert settings.jax_compilation_cache_dir == str(folder) and folder.stat().st_mode & 0o777 == 0o700
+    assert settings.jax_persistent_cache_min_compile_time_secs == 0.0
 
 
-def test_where_the_user_says_otherwise_nothing_changes(settings, tmp_path):
+def test_what_is_too_quick_to_keep_is_the_users_to_say(settings, monkeypatch):
+    monkeypatch.setenv("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "5")
+    compiling.keep_programs()
+    assert settings.jax_compilation_cache_dir and settings.jax_persistent_cache_min_compile_time_secs == 5.0
+
+
+def test_where_programs_are_kept_is_the_users_to_say(settings, tmp_path):
     settings.update("jax_enable_compilation_cache", False)
     compiling.keep_programs()
-    assert settings.jax_compilation_cache_dir is None
+    assert settings.jax_compilation_cache_dir is None and settings.jax_persistent_cache_min_compile_time_secs == 5.0
     settings.update("jax_enable_compilation_cache", True)
     settings.update("jax_compilation_cache_dir", "elsewhere")
     compiling.keep_programs()
     assert settings.jax_compilation_cache_dir == "elsewhere" and not any(tmp_path.iterdir())
+    assert settings.jax_persistent_cache_min_compile_time_secs == 0.0
 
 
 def test_a_cache_that_cannot_be_written_is_told(settings, monkeypatch, tmp_path, capsys):
@@ -161,3 +174,40 @@ def test_what_a_loop_does_is_counted_as_often_as_it_runs():
     assert count(lambda x: jax.lax.cond(x[0, 0] > 0, lambda: x @ x @ x, lambda: x @ x)) == 2 * once
     assert count(lambda x: jax.lax.while_loop(lambda c: c[0, 0] < 9, lambda c: c @ c, x)) == once
     assert count(lambda x: jnp.fft.fft(x.astype(jnp.complex64))) == 2 * count(jnp.fft.rfft) == 8 * 5 * 8 * 3
+
+
+class Tower(nn.Module):
+    """Equal layers, whose `init` draws an equal kernel for each."""
+
+    layers: int
+
+    @nn.compact
+    def __call__(self, x):
+        for _ in range(self.layers):
+            x = nn.Dense(7)(x)
+        return x
+
+
+def test_step_by_step_draws_what_init_draws_and_compiles_no_draw_twice():
+    drawn = [compiling.step_by_step(Tower(layers).init, jax.random.key(0, impl="rbg"), jnp.ones((1, 7))) for layers in (2, 9)]
+    before = len(timing.compilations())
+    again = compiling.step_by_step(Tower(9).init, jax.random.key(0, impl="rbg"), jnp.ones((1, 7)))
+    more = compiling.step_by_step(Tower(12).init, jax.random.key(0, impl="rbg"), jnp.ones((1, 7)))
+    assert len(timing.compilations()) == before
+    whole = jax.jit(Tower(9).init)(jax.random.key(0, impl="rbg"), jnp.ones((1, 7)))
+    jax.tree.map(lambda one, other: np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-7), drawn[1], whole)
+    jax.tree.map(np.testing.assert_array_equal, drawn[1], again)
+    jax.tree.map(np.testing.assert_array_equal, drawn[0], {"params": {name: more["params"][name] for name in drawn[0]["params"]}})
+
+
+def test_step_by_step_leaves_out_what_no_result_needs():
+    def function(tree):
+        jnp.linalg.cholesky(tree["x"])
+        return {"y": [tree["x"] + 1.0]}
+
+    timing.compilations()
+    found = compiling.step_by_step(function, {"x": jnp.eye(11)})
+    np.testing.assert_array_equal(found["y"][0], np.eye(11) + 1.0)
+    assert not any("cholesky" in name for name in timing.compilations())
+    function({"x": jnp.eye(11)})
+    assert any("cholesky" in name for name in timing.compilations())

@@ -2,6 +2,8 @@
 
 import json
 import math
+import subprocess
+import sys
 
 import jax.numpy as jnp
 import numpy as np
@@ -80,6 +82,15 @@ def test_an_error_while_writing_leaves_the_old_file(tmp_path):
         file.write(b"new")
         raise RuntimeError
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
+
+
+def test_processes_that_write_one_path_at_once_leave_a_whole_file(tmp_path):
+    path, other = tmp_path / "x", f"from lala_jax import writers; writers.write_json({str(tmp_path / 'x')!r}, 'other')"
+    with writers.atomic(path) as file:
+        file.write(b"ours")
+        subprocess.run([sys.executable, "-c", other], check=True)
+        assert json.loads(path.read_text()) == "other"
+    assert path.read_bytes() == b"ours" and list(tmp_path.iterdir()) == [path]
 
 
 @pytest.mark.parametrize("shape", [(4, 6), (4, 6, 1), (4, 6, 3), (4, 6, 4)])
