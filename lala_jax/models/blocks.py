@@ -31,11 +31,11 @@ class ResidualBlock(nn.Module):
     def __call__(self, x: jax.Array) -> jax.Array:
         """Map `[..., H, W, C]` to `[..., H / stride, W / stride, out]`."""
         conv = self._conv
-        y = nn.relu(conv(self.mid, 1, "reduce")(x))
-        y = nn.relu(conv(self.mid, 3, "middle", self.stride)(y))
+        y = convolution.relu(conv(self.mid, 1, "reduce")(x))
+        y = convolution.relu(conv(self.mid, 3, "middle", self.stride)(y))
         y = conv(self.out, 1, "expand")(y)
         shortcut = conv(self.out, 1, "shortcut", self.stride)(x) if self.project else x
-        return nn.relu(y + shortcut) if self.last_relu else y + shortcut
+        return convolution.relu(y + shortcut) if self.last_relu else y + shortcut
 
     def _conv(self, features: int, size: int, name: str, stride: int = 1) -> nn.Conv:
         how = {"use_bias": False, "dtype": self.dtype, "name": name} | _gradient(size == 1)
@@ -70,7 +70,7 @@ class ResNet43_8s(nn.Module):
         """
         check_sides(x.shape, self.stages)
         many = x.shape[-1] > 4 * self.width  # as with features of pictures
-        x = nn.relu(nn.Conv(self.width, (3, 3), padding=1, dtype=self.dtype, name="stem", **_gradient(many))(x))
+        x = convolution.relu(nn.Conv(self.width, (3, 3), padding=1, dtype=self.dtype, name="stem", **_gradient(many))(x))
         for stage in range(self.stages):
             x = residual_pair(x, self.width << stage, f"down{stage}", stride=2 if stage else 1, dtype=self.dtype)
         decoded = []

@@ -19,7 +19,7 @@ import numpy as np
 from flax import linen as nn
 from flax import traverse_util
 
-from lala_jax.models import bert, resnet
+from lala_jax.models import bert, convolution, resnet
 
 FLAVOUR = resnet.Flavour("pool", (0, 1, 2), 1.0, (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711), 1e-5)
 
@@ -70,7 +70,7 @@ class Visual(nn.Module):
         """Map RGB in 0..1, `[..., H, W, 3]`, to float32 `[..., (H + 1) // s, (W + 1) // s, width * s]`, `s` of 4, 8, 16 and 32 in turn."""
         x, features = FLAVOUR.prepare(rgb).astype(self.dtype), []
         for index, (out, stride) in enumerate(((self.width // 2, 2), (self.width // 2, 1), (self.width, 1)), 1):
-            x = nn.relu(resnet.ConvNorm(out, 3, stride, FLAVOUR.epsilon, self.dtype, name=f"stem{index}")(x))
+            x = convolution.relu(resnet.ConvNorm(out, 3, stride, FLAVOUR.epsilon, self.dtype, name=f"stem{index}")(x))
         x = nn.avg_pool(x, (2, 2), (2, 2))
         for stage, blocks in enumerate(self.blocks):
             for block in range(blocks):

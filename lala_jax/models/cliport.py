@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from lala_jax.models import blocks, correlation, streams, transporter
+from lala_jax.models import blocks, convolution, correlation, streams, transporter
 from lala_jax.perception import image
 
 
@@ -38,7 +38,7 @@ class SpatialStream(nn.Module):
     def __call__(self, x: jax.Array) -> tuple[jax.Array, list[jax.Array]]:
         """Map `[..., H, W, C]` to `[..., H, W, out]`, and give what entered each layer on the way up, coarse to fine, besides."""
         blocks.check_sides(x.shape, self.stages)
-        x = nn.relu(nn.Conv(self.width, (3, 3), padding=1, dtype=self.dtype, name="stem")(x))
+        x = convolution.relu(nn.Conv(self.width, (3, 3), padding=1, dtype=self.dtype, name="stem")(x))
         for stage in range(self.stages):
             x = blocks.residual_pair(x, self.width << stage, f"down{stage}", stride=2 if stage else 1, dtype=self.dtype)
         laterals = [x]
@@ -75,7 +75,7 @@ class SemanticStream(nn.Module):
         """Map features `[..., H / s, W / s, c]`, fine to coarse, laterals and a sentence `[e]` to `[..., H, W, out]`."""
         *skips, x = features
         level = int(math.log2(laterals[-1].shape[-2] // x.shape[-2]))  # doublings to go
-        x = nn.relu(self._conv(self._width(level), 3, "stem")(x))
+        x = convolution.relu(self._conv(self._width(level), 3, "stem")(x))
         text = nn.Dense(16 * self.width, dtype=self.dtype, name="text")(sentence) if self.text_layer else sentence
         for skip in reversed(skips):
             gate = nn.Dense(x.shape[-1], dtype=self.dtype, bias_init=nn.initializers.ones, name=f"language{level}")
@@ -84,7 +84,7 @@ class SemanticStream(nn.Module):
             x = jnp.concatenate([skip.astype(x.dtype), blocks.upsample(x)], -1)
             for index, width in enumerate((2 * self._width(level), self._width(level))):
                 x = self._conv(width, 3, f"up{level}_conv{index}")(x)
-                x = nn.relu(self._norm(x.ndim, f"up{level}_norm{index}")(x))
+                x = convolution.relu(self._norm(x.ndim, f"up{level}_norm{index}")(x))
             x = self._lateral(x, laterals, level)
         while level:
             level -= 1
@@ -135,7 +135,7 @@ class TwoStream(nn.Module):
         semantic = semantic_net(features, laterals, sentence)
         if self.fusion == "add":
             return spatial.astype(jnp.float32) + semantic.astype(jnp.float32)
-        both = nn.relu(jnp.concatenate([spatial, semantic], -1))
+        both = convolution.relu(jnp.concatenate([spatial, semantic], -1))
         return nn.Conv(self.out, (1, 1), use_bias=False, dtype=self.dtype, name="fuse")(both).astype(jnp.float32)
 
 

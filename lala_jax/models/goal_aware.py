@@ -71,7 +71,7 @@ class ResidualBlock(nn.Module):
     def __call__(self, x):
         width = x.shape[-1]
         y = nn.Conv(width, (3, 3))(nn.LayerNorm()(x))
-        return x + nn.Conv(width, (1, 1), kernel_init=nn.initializers.normal(1e-2))(nn.relu(y))
+        return x + nn.Conv(width, (1, 1), kernel_init=nn.initializers.normal(1e-2))(convolution.relu(y))
 
 
 class VoxelEmbedding(nn.Module):
@@ -82,8 +82,8 @@ class VoxelEmbedding(nn.Module):
 
     @nn.compact
     def __call__(self, x):
-        x = nn.relu(nn.Dense(self.width)(x))
-        x = nn.relu(nn.Dense(self.width)(x))
+        x = convolution.relu(nn.Dense(self.width)(x))
+        x = convolution.relu(nn.Dense(self.width)(x))
         x = nn.Dense(self.embed)(x)
         return x * jax.lax.rsqrt((x * x).sum(-1, keepdims=True) + 1e-6)
 
@@ -96,7 +96,7 @@ class Trunk(nn.Module):
 
     @nn.compact
     def __call__(self, x):
-        x = nn.relu(nn.Conv(2 * self.width, (1, 1))(x))
+        x = convolution.relu(nn.Conv(2 * self.width, (1, 1))(x))
         x = nn.Conv(self.width, (1, 1))(x)
         x = ResidualBlock()(x)
         low = nn.Conv(2 * self.width, (3, 3), strides=(2, 2))(x)
@@ -114,14 +114,14 @@ class KeyNet(nn.Module):
 
     @nn.compact
     def __call__(self, x):
-        high = nn.relu(nn.Conv(self.width, (3, 3))(x))
-        mid = nn.relu(nn.Conv(2 * self.width, (3, 3), strides=(2, 2))(high))
+        high = convolution.relu(nn.Conv(self.width, (3, 3))(x))
+        mid = convolution.relu(nn.Conv(2 * self.width, (3, 3), strides=(2, 2))(high))
         mid = ResidualBlock()(mid)
-        low = nn.relu(nn.Conv(2 * self.width, (3, 3), strides=(2, 2))(mid))
+        low = convolution.relu(nn.Conv(2 * self.width, (3, 3), strides=(2, 2))(mid))
         low = ResidualBlock()(ResidualBlock()(low))
-        mid = nn.relu(nn.Conv(self.width, (3, 3))(mid + _upsample(low, 2)))
+        mid = convolution.relu(nn.Conv(self.width, (3, 3))(mid + _upsample(low, 2)))
         high = high + _upsample(mid, 2)
-        high = nn.relu(nn.Conv(self.width, (3, 3))(high))
+        high = convolution.relu(nn.Conv(self.width, (3, 3))(high))
         return nn.Conv(self.out, (1, 1), kernel_init=nn.initializers.normal(0.1))(high)
 
 
@@ -133,8 +133,8 @@ class QueryNet(nn.Module):
 
     @nn.compact
     def __call__(self, x):
-        x = nn.relu(nn.Conv(self.width, (3, 3))(x))
-        x = nn.relu(nn.Conv(self.width, (3, 3))(x))
+        x = convolution.relu(nn.Conv(self.width, (3, 3))(x))
+        x = convolution.relu(nn.Conv(self.width, (3, 3))(x))
         return nn.Conv(self.out, (3, 3))(x)
 
 
@@ -145,11 +145,11 @@ class RefineNet(nn.Module):
 
     @nn.compact
     def __call__(self, x):
-        x = nn.relu(nn.Conv(self.width, (3, 3))(x))
-        x = nn.relu(nn.Conv(self.width, (5, 5), strides=(2, 2), conv_general_dilated=convolution.blocked)(x))
-        x = nn.relu(nn.Conv(2 * self.width, (3, 3), strides=(2, 2))(x))
-        x = nn.relu(nn.Conv(2 * self.width, (3, 3))(x))
-        x = nn.relu(nn.Dense(4 * self.width)(x.ravel()))
+        x = convolution.relu(nn.Conv(self.width, (3, 3))(x))
+        x = convolution.relu(nn.Conv(self.width, (5, 5), strides=(2, 2), conv_general_dilated=convolution.blocked)(x))
+        x = convolution.relu(nn.Conv(2 * self.width, (3, 3), strides=(2, 2))(x))
+        x = convolution.relu(nn.Conv(2 * self.width, (3, 3))(x))
+        x = convolution.relu(nn.Dense(4 * self.width)(x.ravel()))
         offset = nn.Dense(3, kernel_init=nn.initializers.normal(1e-3))(x)
         return offset, nn.Dense(1, kernel_init=nn.initializers.zeros)(x)[0]
 
@@ -206,8 +206,8 @@ class GoalAware(nn.Module):
         x = _surface_input(current)
         lower = (goal.height - current.height)[..., None] * HEIGHT_SCALE
         x = jnp.concatenate([x, lower, _upsample(self.context_head(context), POOL)], axis=-1)
-        x = nn.relu(self.pick_in(x))
-        return self.pick_out(nn.relu(self.pick_mid(x)))[..., 0]
+        x = convolution.relu(self.pick_in(x))
+        return self.pick_out(convolution.relu(self.pick_mid(x)))[..., 0]
 
     def layout(self, current: types.TopDownMap, goal: types.TopDownMap) -> Layout:
         """Arrange both maps for `place` and `refine`."""

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from lala_jax import types
+from lala_jax.models import convolution
 from lala_jax.perception import transforms
 
 LENGTH = 0.1  # metres that enter as 1
@@ -42,7 +43,7 @@ class Graph(nn.Module):
         return nn.Dense(1, kernel_init=nn.initializers.normal(1e-2), name="score")(pairs[:objects, objects:])[..., 0]
 
     def _mlp(self, x, name):
-        x = nn.relu(nn.Dense(self.width, name=f"{name}_in")(x))
+        x = convolution.relu(nn.Dense(self.width, name=f"{name}_in")(x))
         return nn.LayerNorm(name=f"{name}_norm")(nn.Dense(self.width, name=f"{name}_out")(x))
 
 

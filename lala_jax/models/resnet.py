@@ -15,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import linen as nn
 
+from lala_jax.models import convolution
+
 STAGES = {"stem": 0, "conv2": 3, "conv3": 4, "conv4": 6, "conv5": 3}  # blocks of each, in order
 STRIDED = ("reduce", "middle", "pool")
 
@@ -70,8 +72,35 @@ def _blocks(stage: str) -> Iterator[tuple[str, int, int, bool]]:
             yield f"{name}_{block + 1}", 64 << depth, 2 if depth and not block else 1, not block
 
 
+class Kernel(nn.Module):
+    """Hold a convolution's kernel."""
+
+    shape: tuple[int, int, int, int]  # height, width, channels in and out
+
+    @nn.compact
+    def __call__(self) -> jax.Array:
+        """Give the kernel, float32."""
+        return self.param("kernel", nn.initializers.lecun_normal(), self.shape)
+
+
+class Norm(nn.Module):
+    """Hold what normalises channels by stored statistics."""
+
+    channels: int
+    epsilon: float
+
+    @nn.compact
+    def __call__(self) -> tuple[jax.Array, jax.Array]:
+        """Give what each channel is multiplied by, and what is added then, both `[channels]`, float32."""
+        shape = (self.channels,)
+        scale, bias = self.param("scale", nn.initializers.ones, shape), self.param("bias", nn.initializers.zeros, shape)
+        mean, var = self.variable("batch_stats", "mean", jnp.zeros, shape), self.variable("batch_stats", "var", jnp.ones, shape)
+        factor = scale * jax.lax.rsqrt(var.value + self.epsilon)
+        return factor, bias - mean.value * factor
+
+
 class ConvNorm(nn.Module):
-    """Convolve without a bias and normalise by stored statistics."""
+    """Convolve without a bias and normalise by stored statistics: a convolution whose kernel has the factors in it, and a bias."""
 
     out: int  # channels
     size: int
@@ -82,9 +111,12 @@ class ConvNorm(nn.Module):
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         """Map `[..., H, W, C]` to `[..., ceil(H / stride), ceil(W / stride), out]`."""
-        size, stride = (self.size, self.size), (self.stride, self.stride)
-        x = nn.Conv(self.out, size, stride, padding=self.size // 2, use_bias=False, dtype=self.dtype, name="conv")(x)
-        return nn.BatchNorm(use_running_average=True, epsilon=self.epsilon, dtype=self.dtype, name="norm")(x)
+        kernel = Kernel((self.size, self.size, x.shape[-1], self.out), name="conv")()
+        factor, offset = Norm(self.out, self.epsilon, name="norm")()
+        flat, folded = x.reshape(-1, *x.shape[-3:]).astype(self.dtype), (kernel * factor).astype(self.dtype)
+        strides, pads = (self.stride, self.stride), [(self.size // 2, self.size // 2)] * 2
+        y = jax.lax.conv_general_dilated(flat, folded, strides, pads, dimension_numbers=("NHWC", "HWIO", "NHWC"))
+        return y.reshape(*x.shape[:-3], *y.shape[1:]) + offset.astype(self.dtype)
 
 
 class Bottleneck(nn.Module):
@@ -104,12 +136,12 @@ class Bottleneck(nn.Module):
             return ConvNorm(out, size, stride, self.flavour.epsilon, self.dtype, name=name)
 
         first, second, pool = (self.stride if self.flavour.strided == name else 1 for name in STRIDED)
-        y = nn.relu(layer("reduce", self.mid, 1, first)(x))
-        y = nn.relu(layer("middle", self.mid, 3, second)(y))
+        y = convolution.relu(layer("reduce", self.mid, 1, first)(x))
+        y = convolution.relu(layer("middle", self.mid, 3, second)(y))
         if pool > 1:
             x, y = (nn.avg_pool(z, (pool, pool), (pool, pool)) for z in (x, y))
         y = layer("expand", 4 * self.mid, 1)(y)
-        return nn.relu(y + (layer("shortcut", 4 * self.mid, 1, self.stride // pool)(x) if self.project else x))
+        return convolution.relu(y + (layer("shortcut", 4 * self.mid, 1, self.stride // pool)(x) if self.project else x))
 
 
 class ResNet50(nn.Module):
@@ -140,7 +172,7 @@ class ResNet50(nn.Module):
     def pyramid(self, rgb: jax.Array) -> dict[str, jax.Array]:
         """Map the same to the features after every stage up to the last, by the stage's name."""
         x = self.flavour.prepare(rgb).astype(self.dtype)
-        x = nn.relu(ConvNorm(64, 7, 2, self.flavour.epsilon, self.dtype, name="stem")(x))
+        x = convolution.relu(ConvNorm(64, 7, 2, self.flavour.epsilon, self.dtype, name="stem")(x))
         # Keras pads with zeros and torchvision with -inf: after a ReLU, these are one. nn.max_pool pads one batch dimension at most.
         x = nn.max_pool(jnp.pad(x, [(0, 0)] * (x.ndim - 3) + [(1, 1), (1, 1), (0, 0)]), (3, 3), (2, 2))
         found = {"stem": x}

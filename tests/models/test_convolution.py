@@ -114,3 +114,17 @@ def test_what_has_no_gradient_of_its_own_is_refused(change, message, size, paddi
     how = {"window_strides": (1, 1), "padding": padding} | change
     with pytest.raises(ValueError, match=message):
         convolution.product_gradient(jnp.zeros((1, 8, 8, 3)), jnp.zeros((*size, 3, 4)), **how)
+
+
+def test_relu_is_flaxs_and_its_derivative_needs_the_result_only():
+    x = jnp.asarray([[-jnp.inf, -2.0, -0.0], [0.0, 1e-30, jnp.inf]])
+    slope = jnp.asarray([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
+    for wrap in (lambda function: function, jax.jit, jax.vmap):
+        got, back = jax.vjp(wrap(convolution.relu), x)
+        want, want_back = jax.vjp(wrap(nn.relu), x)
+        np.testing.assert_array_equal(got, want)
+        np.testing.assert_array_equal(*back(slope), *want_back(slope))
+    for relu, needed in ((convolution.relu, True), (nn.relu, False)):
+        program = jax.make_jaxpr(jax.grad(lambda x, relu=relu: relu(x).sum()))(x)
+        (compare,) = (line for line in program.eqns if line.primitive.name in ("ne", "gt"))
+        assert (compare.invars[0] in program.jaxpr.eqns[0].outvars) == needed
