@@ -161,7 +161,7 @@ def unstacked(drawn: types.Scene) -> list[types.Scene]:
 def training_step(config) -> timing.Work:
     """Take training steps: draw, augment, render, fuse, loss, gradient, update."""
     recipe, states, key = build.recipe(config), states_of(config, BATCH), jax.random.key(0)
-    step = compiling.jit(functools.partial(train_step.train_step, recipe), donate_argnums=0)
+    step = compiling.jit_step(functools.partial(train_step.train_step, recipe))
     return timing.stepping(step, train.fresh(recipe, 0), states, key, recipe.policy.frozen, count=recipe.batch_size)
 
 
@@ -207,7 +207,7 @@ def paper_network(config, *, rows: int = 320, cols: int = 160, batch: int = 1, *
     key = jax.random.key(0, impl="rbg")
     params = compiling.step_by_step(net.init, key, example["current"], example["goal"], example["pick"])["params"]
     examples = jax.tree.map(lambda leaf: jnp.stack([leaf] * batch), example)
-    return timing.stepping(compiling.jit(step, donate_argnums=0), (params, optimizer.init(params)), examples, count=batch)
+    return timing.stepping(compiling.jit_step(step), (params, optimizer.init(params)), examples, count=batch)
 
 
 def correlate_torch(config, **sizes) -> timing.Work:

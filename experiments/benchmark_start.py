@@ -20,7 +20,7 @@ def main() -> None:
     recipe, states = build.recipe(config), benchmark_stages.states_of(config, benchmark_stages.BATCH)
     with tempfile.TemporaryDirectory() as folder:
         run = train.start_or_resume(config, recipe, checkpoint.Checkpoints(pathlib.Path(folder)))
-    step = loop.compiled(train.step, recipe, run, states, jax.random.key(config.seed), recipe.policy.frozen)
+    step = loop.compiled(train.step(), recipe, run, states, jax.random.key(config.seed), recipe.policy.frozen)
     jax.block_until_ready(step(run))
 
 

@@ -33,6 +33,15 @@ jit = functools.partial(jax.jit, compiler_options=OPTIONS)
 """`jax.jit` with OPTIONS; as with any compiler options, what it wraps cannot be called in another jitted function."""
 
 
+def jit_step(function: Callable[..., Any], *, state: int = 0, **how: Any):
+    """Jit a step, whose argument number `state` becomes the first of its results: in the same memory (donated), unless on a GPU.
+
+    There cuDNN gives gradients in an order of their own. The update turns them and cannot write in place, so that XLA would write the new
+    state elsewhere and then copy it, entry for entry of the tree. This looks which platform there is, for which JAX starts.
+    """
+    return jit(function, donate_argnums=() if jax.default_backend() == "gpu" else state, **how)
+
+
 def build(jitted, *arguments: Any) -> tuple[Any, dict[str, float]]:
     """Compile a jitted function for its arguments, static ones among them, without running it.
 

@@ -23,7 +23,11 @@ from lala_jax.sim.tasks import base
 
 WORKDIR = "runs/pretrain-<task>"  # the default of --workdir
 
-step = compiling.jit(pretrain_step.pretrain_step, static_argnums=0, donate_argnums=1)
+
+@functools.cache
+def step():
+    """Jit the step of pre-training, once for a process."""
+    return compiling.jit_step(pretrain_step.pretrain_step, state=1, static_argnums=0)
 
 
 def draw_states(config: Mapping[str, Any]) -> types.State:
@@ -84,7 +88,7 @@ def _pretrain(config, recipe: pretrain_step.Recipe, out: pathlib.Path) -> pathli
     stored = {"config": options.to_dict(config), "input_spec": {"encoder": recipe.model.stage}}
     with loop.session(out) as (writer, stopped):
         run = loop.run(
-            lambda run: loop.compiled(step, recipe, run, states, frozen, key), run, total=config.pretrain.steps,
+            lambda run: loop.compiled(step(), recipe, run, states, frozen, key), run, total=config.pretrain.steps,
             log_every=config.train.log_every, save_every=config.train.save_every,
             save=lambda number, run: store.save_latest(number, run, **stored), writer=writer,
             note=lambda mean: f"loss {mean['loss']:.3f}, {mean['explained']:.1%} explained", stopped=stopped,

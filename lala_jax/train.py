@@ -7,6 +7,7 @@ for bit. Several devices share every batch, and the processes that a scheduler s
 
 from __future__ import annotations
 
+import functools
 import pathlib
 from collections.abc import Mapping
 from typing import Any
@@ -30,7 +31,11 @@ from lala_jax import (
     writers,
 )
 
-step = compiling.jit(train_step.train_step, static_argnums=0, donate_argnums=1)
+
+@functools.cache
+def step():
+    """Jit the training step, once for a process."""
+    return compiling.jit_step(train_step.train_step, state=1, static_argnums=0)
 
 
 def load_states(config: Mapping[str, Any], mesh: jax.sharding.Mesh | None = None) -> types.State:
@@ -91,7 +96,7 @@ def _loop(config, recipe, run, states, store, stored, writer, stopped) -> state.
         return due
 
     return loop.run(
-        lambda run: loop.compiled(step, recipe, run, states, key, frozen), run, total=config.train.steps,
+        lambda run: loop.compiled(step(), recipe, run, states, key, frozen), run, total=config.train.steps,
         log_every=config.train.log_every, save_every=config.train.save_every,
         save=lambda number, run: store.save_latest(number, run, **stored), writer=writer,
         note=lambda mean: f"loss {mean['loss']:.2f}, pick {mean['pick_right']:.2f}, place {mean['place_right']:.2f}",

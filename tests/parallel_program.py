@@ -62,11 +62,11 @@ def start(recipe):
 def advance(recipe, steps=3):
     """Take steps: the state and each step's metrics. It is compiled once."""
     run, data, found = start(recipe), parallel.place(test_train_step.states(), recipe.mesh), []
-    frozen, before = recipe.policy.frozen, train.step._cache_size()
+    frozen, before = recipe.policy.frozen, train.step()._cache_size()
     for _ in range(steps):
-        run, metrics = train.step(recipe, run, data, jax.random.key(0), frozen)
+        run, metrics = train.step()(recipe, run, data, jax.random.key(0), frozen)
         found.append({name: float(value) for name, value in jax.device_get(metrics).items()})
-    assert train.step._cache_size() == before + 1
+    assert train.step()._cache_size() == before + 1
     return run, found
 
 

@@ -91,6 +91,14 @@ def test_memory_is_not_asked_for_again():
     assert 3 * pages("keep", MALLOC_MMAP_THRESHOLD_="65536") > asked
 
 
+@pytest.mark.parametrize("platform", ["cpu", "gpu", "tpu"])
+def test_a_step_takes_its_states_memory_but_on_a_gpu(platform, monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: platform)
+    jitted = compiling.jit_step(lambda n, state, x: (state + n * x, x), state=1, static_argnums=0)
+    donated = [leaf.donated for leaf in jax.tree.leaves(jitted.lower(2, jnp.ones(3), jnp.ones(3)).args_info)]
+    assert donated == [platform != "gpu", False]
+
+
 def test_donated_memory_is_counted_once_and_static_arguments_are_left_out():
     x = jnp.zeros(1 << 18)
     jitted = compiling.jit(lambda n, x: x + n, static_argnums=0, donate_argnums=1)

@@ -196,7 +196,7 @@ def test_two_processes_are_one_run(start_pair, tmp_path):
     resumed, losses, late = train.start_or_resume(config, recipe, checkpoint.Checkpoints(workdir / "checkpoints")), {}, {}
     for run, seen in ((fresh, losses), (resumed, late)):
         for number in range(int(run.step) + 1, 5):
-            run, metrics = train.step(recipe, run, data, key, recipe.policy.frozen)
+            run, metrics = train.step()(recipe, run, data, key, recipe.policy.frozen)
             seen[number] = float(metrics["loss"])
     assert sorted(late) == list(range(stopped + 1, 5))
 

@@ -57,7 +57,7 @@ def drawn():
 def advance(run, steps):
     seen, frozen = [], fresh()[1]
     for _ in range(steps):
-        run, metrics = pretrain.step(recipe(), run, states(), frozen, jax.random.key(0))
+        run, metrics = pretrain.step()(recipe(), run, states(), frozen, jax.random.key(0))
         seen.append(metrics)
     return run, jax.device_get(seen)
 

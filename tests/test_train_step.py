@@ -56,7 +56,7 @@ def advance(run, steps, *, data=None, seed=0):
     """Take steps as `train` does, giving the state and the last step's metrics; `run` is donated."""
     metrics = {}
     for _ in range(steps):
-        run, metrics = train.step(recipe(), run, states() if data is None else data, jax.random.key(seed), recipe().policy.frozen)
+        run, metrics = train.step()(recipe(), run, states() if data is None else data, jax.random.key(seed), recipe().policy.frozen)
     return run, jax.device_get(metrics)
 
 
@@ -66,9 +66,9 @@ def bits(tree):
 
 def test_save_and_restore_between_steps_change_no_bit(tmp_path):
     """Law 6: 2 steps, save, restore in a new store, 2 steps = 4 steps; and all of them in one compilation."""
-    train.step.clear_cache()
+    train.step().clear_cache()
     whole, last = advance(start(), 4)
-    assert train.step._cache_size() == 1
+    assert train.step()._cache_size() == 1
     half, _ = advance(start(), 2)
     checkpoint.Checkpoints(tmp_path).save_latest(2, half, config=options.to_dict(tiny_config()), input_spec={})
     restored = train.start_or_resume(tiny_config(), recipe(), checkpoint.Checkpoints(tmp_path))
@@ -76,7 +76,7 @@ def test_save_and_restore_between_steps_change_no_bit(tmp_path):
     resumed, again = advance(restored, 2)
     assert bits(resumed) == bits(whole) and bits(again) == bits(last)
     assert int(whole.step) == 4 and bits(whole.params) != bits(start().params) != bits(whole.average)
-    assert train.step._cache_size() == 1
+    assert train.step()._cache_size() == 1
 
 
 def test_randomness_is_the_key_and_the_step():
