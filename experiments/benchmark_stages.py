@@ -125,7 +125,7 @@ def features(config) -> timing.Work:
 def act(config) -> timing.Work:
     """Let the policy act on one pair of maps."""
     agent = build.build_policy(config)
-    params = compiling.step_by_step(agent.init, jax.random.key(0, impl="rbg"))
+    params = compiling.draw(agent.init, 0)
     blank = policy.empty_map(agent.spec)
     return timing.compiled(agent.act, params, blank, blank)
 
@@ -204,8 +204,7 @@ def paper_network(config, *, rows: int = 320, cols: int = 160, batch: int = 1, *
         updates, moments = optimizer.update(grads, moments)
         return (optax.apply_updates(params, updates), moments), {name: leaf.max() for name, leaf in logits.items()}
 
-    key = jax.random.key(0, impl="rbg")
-    params = compiling.step_by_step(net.init, key, example["current"], example["goal"], example["pick"])["params"]
+    params = compiling.draw(net.init, 0, example["current"], example["goal"], example["pick"])["params"]
     examples = jax.tree.map(lambda leaf: jnp.stack([leaf] * batch), example)
     return timing.stepping(compiling.jit_step(step), (params, optimizer.init(params)), examples, count=batch)
 

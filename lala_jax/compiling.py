@@ -75,6 +75,11 @@ def step_by_step(function: Callable[..., Any], *arguments: Any) -> Any:
     return jax.tree.unflatten(jax.tree.structure(shapes), results)
 
 
+def draw(init: Callable[..., Any], seed: int, *arguments: Any) -> Any:
+    """Draw a network's parameters, `init(key, *arguments)`, by `step_by_step` and with a key that compiles in a quarter of the time."""
+    return step_by_step(init, jax.random.key(seed, impl="rbg"), *arguments)
+
+
 def memory_of(program) -> float:
     """Give the bytes that a compiled program needs for a run, as XLA plans it; 0 where it does not tell."""
     plan = program.memory_analysis()

@@ -55,7 +55,7 @@ def start(config: Mapping[str, Any], recipe: pretrain_step.Recipe, states: types
     """Give a fresh state, and the encoder's stored means and variances; the encoder starts at `pretrain.start`, or at random without."""
     shapes = jax.eval_shape(functools.partial(pretrain_step.batch, recipe), jax.random.key(0), states)
     one = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[1:], leaf.dtype), shapes)
-    variables = compiling.step_by_step(recipe.model.init, jax.random.key(config["seed"], impl="rbg"), *one)
+    variables = compiling.draw(recipe.model.init, config["seed"], *one)
     if name := config["pretrain"]["start"]:
         _, loaded = backbone.load(name, stage=recipe.model.stage)
         variables = {kind: {**tree, "encoder": loaded[kind]} for kind, tree in variables.items()}

@@ -196,11 +196,11 @@ class Tower(nn.Module):
         return x
 
 
-def test_step_by_step_draws_what_init_draws_and_compiles_no_draw_twice():
-    drawn = [compiling.step_by_step(Tower(layers).init, jax.random.key(0, impl="rbg"), jnp.ones((1, 7))) for layers in (2, 9)]
+def test_draw_gives_what_init_draws_and_compiles_no_draw_twice():
+    drawn = [compiling.draw(Tower(layers).init, 0, jnp.ones((1, 7))) for layers in (2, 9)]
     before = len(timing.compilations())
-    again = compiling.step_by_step(Tower(9).init, jax.random.key(0, impl="rbg"), jnp.ones((1, 7)))
-    more = compiling.step_by_step(Tower(12).init, jax.random.key(0, impl="rbg"), jnp.ones((1, 7)))
+    again = compiling.draw(Tower(9).init, 0, jnp.ones((1, 7)))
+    more = compiling.draw(Tower(12).init, 0, jnp.ones((1, 7)))
     assert len(timing.compilations()) == before
     whole = jax.jit(Tower(9).init)(jax.random.key(0, impl="rbg"), jnp.ones((1, 7)))
     jax.tree.map(lambda one, other: np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-7), drawn[1], whole)

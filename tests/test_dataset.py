@@ -171,7 +171,7 @@ def test_a_kill_while_writing_leaves_whole_shards(path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         dataset.append(path, [make_demo(2)], task="tower", task_options=OPTIONS)
     monkeypatch.undo()
-    (path / "shard-000001.demo.tmp").write_bytes(b"half")  # what SIGKILL leaves
+    (path / "shard-000001.demo.1.tmp").write_bytes(b"half")  # what SIGKILL leaves
     assert len(dataset.load(path)[0]) == 2
     dataset.append(path, [make_demo(2)], task="tower", task_options=OPTIONS)
     assert len(dataset.load(path)[0]) == 3

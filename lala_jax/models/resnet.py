@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -72,17 +73,6 @@ def _blocks(stage: str) -> Iterator[tuple[str, int, int, bool]]:
             yield f"{name}_{block + 1}", 64 << depth, 2 if depth and not block else 1, not block
 
 
-class Kernel(nn.Module):
-    """Hold a convolution's kernel."""
-
-    shape: tuple[int, int, int, int]  # height, width, channels in and out
-
-    @nn.compact
-    def __call__(self) -> jax.Array:
-        """Give the kernel, float32."""
-        return self.param("kernel", nn.initializers.lecun_normal(), self.shape)
-
-
 class Norm(nn.Module):
     """Hold what normalises channels by stored statistics."""
 
@@ -111,12 +101,14 @@ class ConvNorm(nn.Module):
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         """Map `[..., H, W, C]` to `[..., ceil(H / stride), ceil(W / stride), out]`."""
-        kernel = Kernel((self.size, self.size, x.shape[-1], self.out), name="conv")()
         factor, offset = Norm(self.out, self.epsilon, name="norm")()
-        flat, folded = x.reshape(-1, *x.shape[-3:]).astype(self.dtype), (kernel * factor).astype(self.dtype)
-        strides, pads = (self.stride, self.stride), [(self.size // 2, self.size // 2)] * 2
-        y = jax.lax.conv_general_dilated(flat, folded, strides, pads, dimension_numbers=("NHWC", "HWIO", "NHWC"))
-        return y.reshape(*x.shape[:-3], *y.shape[1:]) + offset.astype(self.dtype)
+
+        def scaled(x: jax.Array, kernel: jax.Array, *where: Any, **how: Any) -> jax.Array:
+            return jax.lax.conv_general_dilated(x, (kernel * factor).astype(kernel.dtype), *where, **how)
+
+        size, stride, how = (self.size, self.size), (self.stride, self.stride), {"use_bias": False, "dtype": self.dtype, "name": "conv"}
+        x = nn.Conv(self.out, size, stride, padding=self.size // 2, conv_general_dilated=scaled, **how)(x)
+        return x + offset.astype(self.dtype)
 
 
 class Bottleneck(nn.Module):

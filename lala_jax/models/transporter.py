@@ -80,8 +80,8 @@ class Transporter(nn.Module):
 
     The defaults are the paper's: 64 x 64 crops, 36 rotations, three channels of key and query. A smaller `width`,
     `stages` and `crop` make a compact one. Raises ValueError for an unknown `variant`, for a crop that the strides do
-    not divide and for fewer than one rotation. Jit `init`, or it runs the networks, and give it a key of `impl="rbg"`:
-    compiling the default kind for a CPU takes most of a second for every tensor.
+    not divide and for fewer than one rotation. Its parameters are quickest drawn by `lala_jax.compiling.draw`; `init` as it is runs the
+    networks, too.
     """
 
     variant: str = "two_stream"  # one of VARIANTS
