@@ -11,6 +11,7 @@ import importlib.util
 import itertools
 import os
 import pickle
+import re
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
@@ -23,6 +24,7 @@ from lala_jax import options
 
 DATA = "data"
 EXPLICIT = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
+VISIBLE = ("CUDA_VISIBLE_DEVICES", "ROCR_VISIBLE_DEVICES", "HIP_VISIBLE_DEVICES")
 PATIENCE = 7 * 24 * 3600 * 1000  # milliseconds that processes wait for what the first one does; one that dies is noticed at once
 
 T = TypeVar("T")
@@ -39,7 +41,8 @@ def launched(environ: Mapping[str, str]) -> dict[str, Any] | None:
     """Read from a process's environment what `jax.distributed.initialize` is to be told; None where the process is alone.
 
     The variables of EXPLICIT come first, then a Slurm step, Open MPI, and a pod of an Indexed Job where the package `kubernetes` is
-    installed; what is not told JAX finds out itself. Raises OptionsError where a variable of EXPLICIT is missing or no number.
+    installed; what is not told JAX finds out itself. Raises OptionsError where a variable of EXPLICIT is missing or no number, and where
+    Open MPI, from its version 5 on, does not tell where the first process is.
     """
     incomplete = options.OptionsError(f"the environment sets some, but not all of {', '.join(EXPLICIT)}")
     address, *numbers = (environ.get(name) for name in EXPLICIT)
@@ -51,9 +54,17 @@ def launched(environ: Mapping[str, str]) -> dict[str, Any] | None:
             raise options.OptionsError(f"JAX_PROCESS_ID must be from 0 to JAX_NUM_PROCESSES - 1 = {count - 1}, got {process}")
         return {"coordinator_address": address, "num_processes": count, "process_id": process} if count > 1 else None
     if "SLURM_STEP_NODELIST" in environ:  # inside srun; a batch script by itself is one process, whatever the job's tasks
-        count = _number(environ, "SLURM_STEP_NUM_TASKS" if "SLURM_STEP_NUM_TASKS" in environ else "SLURM_NTASKS")
+        told = {"num_processes": _number(environ, "SLURM_STEP_NUM_TASKS" if "SLURM_STEP_NUM_TASKS" in environ else "SLURM_NTASKS")}
+        beside = environ.get("SLURM_STEP_TASKS_PER_NODE", "")  # 4 or 4(x2), where they are as many on every node
+        here = re.fullmatch(r"(\d+)(\(x\d+\))?", beside)
+        devices = _devices(environ, environ.get("SLURM_LOCALID"), here and here[1], own="SLURM_GPUS_PER_TASK" in environ)
     elif "OMPI_COMM_WORLD_SIZE" in environ:
-        count = _number(environ, "OMPI_COMM_WORLD_SIZE")
+        told = {"num_processes": _number(environ, "OMPI_COMM_WORLD_SIZE")}
+        if told["num_processes"] > 1 and "OMPI_MCA_orte_hnp_uri" not in environ:
+            if address is None:
+                raise options.OptionsError(f"Open MPI 5 does not tell where the first process is: set {EXPLICIT[0]}=HOST:PORT")
+            told |= {"coordinator_address": address, "process_id": _number(environ, "OMPI_COMM_WORLD_RANK")}
+        devices = _devices(environ, environ.get("OMPI_COMM_WORLD_LOCAL_RANK"), environ.get("OMPI_COMM_WORLD_LOCAL_SIZE"), own=False)
     else:
         indexed = {"KUBERNETES_SERVICE_HOST", "JOB_COMPLETION_INDEX"} <= environ.keys()
         if indexed and importlib.util.find_spec("kubernetes"):
@@ -61,7 +72,21 @@ def launched(environ: Mapping[str, str]) -> dict[str, Any] | None:
         if address is not None:  # what a scheduler would tell is missing
             raise incomplete
         return None
-    return {"num_processes": count} if count > 1 else None
+    return {**told, **devices} if told["num_processes"] > 1 else None
+
+
+def _devices(environ: Mapping[str, str], place: str | None, beside: str | None, *, own: bool) -> dict[str, Any]:
+    """Say which GPUs that a process sees are its own, where JAX, which takes the one numbered as its `place` on the node, would err.
+
+    All, where it is the only one `beside` itself on the node, or where what it sees is its `own`; else an equal share of them.
+    """
+    seen = next((environ[name] for name in VISIBLE if environ.get(name)), "").split(",")
+    if "JAX_LOCAL_DEVICE_IDS" in environ or None in (place, beside):
+        return {}
+    if own or beside == "1" or len(seen) == 1 and seen[0]:
+        return {"local_device_ids": []}  # JAX then takes them all
+    share, first = len(seen) // int(beside), int(place)
+    return {"local_device_ids": list(range(first * share, (first + 1) * share))} if share > 1 else {}
 
 
 def _number(environ: Mapping[str, str], name: str) -> int:

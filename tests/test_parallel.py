@@ -228,7 +228,8 @@ TOLD = {"coordinator_address": "node1:1234", "num_processes": 2, "process_id": 1
         (STEP, {"num_processes": 8}),
         ({**STEP, "SLURM_STEP_NUM_TASKS": "1"}, None),  # srun -n 1 in a larger job
         ({**STEP, "JAX_COORDINATOR_ADDRESS": "node1:1234"}, {"num_processes": 8}),  # which JAX reads itself
-        ({"OMPI_COMM_WORLD_SIZE": "4"}, {"num_processes": 4}),
+        ({"OMPI_COMM_WORLD_SIZE": "4", "OMPI_MCA_orte_hnp_uri": "1.0;tcp://10.0.0.1:9"}, {"num_processes": 4}),
+        ({"OMPI_COMM_WORLD_SIZE": "2", "OMPI_COMM_WORLD_RANK": "1", "JAX_COORDINATOR_ADDRESS": "node1:1234"}, TOLD),  # Open MPI 5
         ({"OMPI_COMM_WORLD_SIZE": "1"}, None),
         ({"KUBERNETES_SERVICE_HOST": "10.0.0.1"}, None),  # any pod
         (EXPLICIT, TOLD),
@@ -240,6 +241,39 @@ def test_what_the_environment_says(environ, told):
     assert parallel.launched(environ) == told
 
 
+FOUR, OWN = {"CUDA_VISIBLE_DEVICES": "0,1,2,3"}, {"CUDA_VISIBLE_DEVICES": "2"}
+
+
+@pytest.mark.parametrize(
+    ("environ", "devices"),  # None: as many as JAX numbers them, one each
+    [
+        ({"SLURM_STEP_TASKS_PER_NODE": "4(x2)"}, None),
+        ({"SLURM_STEP_TASKS_PER_NODE": "4(x2)", **FOUR}, None),
+        ({"SLURM_STEP_TASKS_PER_NODE": "4(x2)", **OWN}, []),  # srun --gpus-per-task=1: each sees its own, as number 0
+        ({"SLURM_STEP_TASKS_PER_NODE": "2(x4)", "SLURM_GPUS_PER_TASK": "2", "CUDA_VISIBLE_DEVICES": "0,1"}, []),
+        ({"SLURM_STEP_TASKS_PER_NODE": "2(x4)", **FOUR}, [2, 3]),
+        ({"SLURM_STEP_TASKS_PER_NODE": "1(x8)", **FOUR}, []),  # all four are the only task's
+        ({"SLURM_STEP_TASKS_PER_NODE": "1(x8)"}, []),
+        ({"SLURM_STEP_TASKS_PER_NODE": "4,4(x1)"}, None),  # which of them are here is not said
+        ({"SLURM_STEP_TASKS_PER_NODE": "1(x8)", "JAX_LOCAL_DEVICE_IDS": "0"}, None),  # which JAX reads itself
+    ],
+)
+@pytest.mark.parametrize("launcher", ["slurm", "mpi"])
+def test_every_process_takes_its_own_devices(environ, devices, launcher):
+    """As `jax.distributed.initialize` would set them: `[]` and all that it sees, numbers, or None and the one of its place on the node."""
+    if launcher == "mpi":
+        beside = environ["SLURM_STEP_TASKS_PER_NODE"].partition("(")[0]
+        if "SLURM_GPUS_PER_TASK" in environ or "," in beside:
+            pytest.skip("Open MPI knows no such thing")
+        named = {"SIZE": "8", "LOCAL_RANK": "1" if beside != "1" else "0", "LOCAL_SIZE": beside}
+        environ = {**environ, "OMPI_MCA_orte_hnp_uri": "", **{f"OMPI_COMM_WORLD_{name}": value for name, value in named.items()}}
+        del environ["SLURM_STEP_TASKS_PER_NODE"]
+    else:
+        environ = {**STEP, "SLURM_LOCALID": "0" if environ["SLURM_STEP_TASKS_PER_NODE"][0] == "1" else "1", **environ}
+    told = parallel.launched(environ)
+    assert told.pop("num_processes") == 8 and told == ({} if devices is None else {"local_device_ids": devices})
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -247,6 +281,10 @@ def test_what_the_environment_says(environ, told):
         ({"JAX_NUM_PROCESSES": None, "JAX_PROCESS_ID": None}, "some, but not all of JAX_COORDINATOR_ADDRESS"),  # nor any scheduler
         ({"JAX_PROCESS_ID": "2"}, "JAX_PROCESS_ID must be from 0 to JAX_NUM_PROCESSES - 1 = 1, got 2"),
         ({"JAX_NUM_PROCESSES": "two"}, "JAX_NUM_PROCESSES must be a whole number, got 'two'"),
+        (
+            {**dict.fromkeys(EXPLICIT), "OMPI_COMM_WORLD_SIZE": "2"},
+            "Open MPI 5 does not tell where .*: set JAX_COORDINATOR_ADDRESS=HOST:PORT",
+        ),
     ],
 )
 def test_a_wrong_environment_is_refused(change, message):
