@@ -129,6 +129,7 @@ def draw(key: jax.Array, state: types.State, *, spec: types.MapSpec, rotations: 
     drawn as the demonstrations pick, about the middle of the face.
     """
     key_object, key_cell = jax.random.split(key)
+    state = jax.tree.map(jnp.asarray, state)  # outside jit it may be as a data set has it
     whole, middle = (losses.pick_valid(state, spec=spec, share=share) for share in (1.0, MIDDLE))
     cells = whole if multi_action else middle
     candidates = candidates & cells.any((1, 2))

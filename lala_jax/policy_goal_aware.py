@@ -51,6 +51,7 @@ class GoalAwarePolicy:
     def loss(self, params, key: jax.Array, state: types.State, current: types.TopDownMap, goal: types.TopDownMap):
         """Give `(loss, metrics)` of one example; any object that is not yet placed may teach the place and the match."""
         key_draw, key_match, key_refine = jax.random.split(key, 3)
+        state = jax.tree.map(jnp.asarray, state)
         variables, model, spec = {"params": params}, self.model, self.spec
         candidates = state.ready if not self.multi_action else ~state.placed
         sample = policy.draw(key_draw, state, spec=spec, rotations=model.rotations, candidates=candidates, multi_action=self.multi_action)

@@ -35,6 +35,7 @@ class GraphPolicy:
     def loss(self, params, key: jax.Array, state: types.State, current: types.TopDownMap, goal: types.TopDownMap):
         """Give `(loss, metrics)` of one example: cross-entropy over all pairs, right are the objects that may go next to their goals."""
         del current, goal
+        state = jax.tree.map(jnp.asarray, state)  # outside jit it may be as a data set has it
         logits = self.model.apply({"params": params}, state)
         right = jnp.diag(state.ready)
         if not self.multi_action:
@@ -48,6 +49,7 @@ class GraphPolicy:
     def act(self, params, current: types.TopDownMap, goal: types.TopDownMap, truth: types.State) -> tuple[types.PickPlace, policy.Heatmaps]:
         """Choose an action: the best object by the middle of its top, to the best goal pose, by the least turn that looks right."""
         del current, goal
+        truth = jax.tree.map(jnp.asarray, truth)
         logits = self.model.apply({"params": params}, truth)
         index, where = policy.argmax_index(logits)
         now, then, size = truth.poses[index], truth.goal[where], truth.size[index]

@@ -11,6 +11,7 @@ import numpy as np
 import optax
 import pytest
 from test_policy import GOAL_AWARE, POLICIES, ROTATIONS, SPEC, batch_of, batched_loss, check_action, example, state_of
+from test_policy_graph import GRAPH
 
 from lala_jax import policy, policy_goal_aware, types
 from lala_jax.models import goal_aware
@@ -226,6 +227,19 @@ def test_switches_take_their_losses_along():
     ):
         loss, metrics = jax.eval_shape(agent.loss, params, jax.random.key(0), state_of(0), blank, blank)
         assert set(metrics) == names and loss.shape == ()
+
+
+@pytest.mark.parametrize("agent", [*POLICIES.values(), GRAPH], ids=[*POLICIES, "graph"])
+def test_a_state_as_a_data_set_has_it_will_do(agent):
+    """NumPy's arrays, which cannot be indexed by what JAX traces."""
+    blank = policy.empty_map(SPEC)
+    state = jax.tree.map(np.asarray, state_of(0))
+    params = jax.eval_shape(agent.init, jax.random.key(0))
+    shape, _ = jax.eval_shape(lambda params: agent.loss(params, jax.random.key(0), state, blank, blank), params)
+    assert shape.shape == ()
+    if agent.privileged:
+        action, _ = jax.eval_shape(lambda params: agent.act(params, blank, blank, state), params)
+        assert action.pick.shape == (3,)
 
 
 def means(metrics):
