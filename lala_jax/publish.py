@@ -110,7 +110,7 @@ def _score_rows(files: Sequence[str], source: str, params: Any, config: Mapping[
             if changed:
                 raise options.OptionsError(f"{file} holds scores of another {', '.join(changed)}, here: {source}")
             rows.append({**_row(found, ("split", "seeds", "device"), file), "file": file})
-            place = {"split": found["split"], "start": _start(found), "episodes": found["episodes"]}
+            place = _place(found)
             settings.append({**found["config"]["eval"], **place})
         except (KeyError, TypeError) as error:
             raise options.OptionsError(f"{file} is no file of scores: {type(error).__name__} {error}") from error
@@ -142,14 +142,14 @@ def _same_weights(found: Mapping[str, Any], source: str, params: Any) -> bool:
     return there.keys() == here.keys() and all(np.array_equal(there[name], here[name]) for name in there)
 
 
-def _start(found: Mapping[str, Any]) -> int:
-    """Give the place of a score file's first seed in its split: the inverse of `build.split_seeds`."""
-    first, last = found["seeds"]
-    start = first - build.TEST_START if found["split"] == "test" else first // 2
-    seeds = build.split_seeds(found["split"], start, found["episodes"])
-    if [seeds[0], seeds[-1]] != [first, last]:
-        raise options.OptionsError(f"{found['episodes']} episodes of the {found['split']} split are not seeds {first} to {last}")
-    return start
+def _place(found: Mapping[str, Any]) -> dict[str, Any]:
+    """Give split, start and number of the seeds that a score file is of: the inverse of `build.split_seeds`."""
+    (first, last), split, scored = found["seeds"], found["split"], found["episodes"]
+    start, count = (first - build.TEST_START, last - first + 1) if split == "test" else (first // 2, (last - first) // 2 + 1)
+    seeds = build.split_seeds(split, start, count) if count > 0 else [0]
+    if [seeds[0], seeds[-1]] != [first, last] or scored > count:  # fewer, where scenes without room were passed over
+        raise options.OptionsError(f"{scored} episodes of the {split} split are not seeds {first} to {last}")
+    return {"split": split, "start": start, "episodes": count}
 
 
 def _data(config: Mapping[str, Any]) -> dict[str, Any]:

@@ -13,6 +13,7 @@ import numpy as np
 
 from lala_jax import build, checkpoint, cluster, compiling, observe, options, pictures, policy, pretrained, rollout, types, writers
 from lala_jax.sim import oracle
+from lala_jax.sim.tasks import base
 
 AGENTS = ("policy", *oracle.AGENTS)
 FAILURES = 3  # failed episodes that are drawn
@@ -96,13 +97,15 @@ def evaluate(
 
     The first `strips` episodes are drawn, as `("episode", 0)` and so on, and, where any are, the first `FAILURES` that score below 100,
     as `("failure", 0)` and so on. With `places`, one of `spans`, only the seeds at these are run, bit for bit as
-    among all; failures are then numbered within.
+    among all; failures are then numbered within. Scenes without room for all objects are passed over; raises `NoFreePose` where no other
+    is left.
     """
     task, parallel, episodes, drawn, failed = observer.task, min(parallel, len(seeds)), [], {}, 0
     places = range(len(seeds)) if places is None else places
     for start in range(places.start, places.stop, parallel):
-        chunk = list(seeds[start : start + parallel])
-        scenes = [task.sample(s) for s in chunk]
+        chunk, scenes = _with_room(task, seeds[start : start + parallel])
+        if not chunk:
+            continue
         actor = PolicyAgent(agent, params, observer, scenes, parallel=parallel, key=jax.random.fold_in(jax.random.key(seed), start))
         done = rollout.run(task, scenes, chunk, actor, threads=threads)
         names = {("episode", start + i): i for i in range(min(strips - start, len(done)))}
@@ -114,8 +117,20 @@ def evaluate(
         drawn |= {name: strip[i] for name, i in names.items()}
         episodes += done
         if progress is not None:
-            progress(len(episodes), len(places))
-    return rollout.summary(episodes), drawn
+            progress(min(start + parallel, places.stop) - places.start, len(places))
+    return rollout.summary(_some(episodes, seeds)), drawn
+
+
+def _with_room(task, seeds: Sequence[int]) -> tuple[list[int], list[types.Scene]]:
+    """Give the seeds whose scenes have room for all objects, and these scenes."""
+    pairs = list(task.roomy(seeds))
+    return [seed for seed, _ in pairs], [scene for _, scene in pairs]
+
+
+def _some(episodes: list[rollout.Episode], seeds: Sequence[int]) -> list[rollout.Episode]:
+    if not episodes:
+        raise base.NoFreePose(f"none of the scenes of seeds {seeds[0]} to {seeds[-1]} has a free pose for every object")
+    return episodes
 
 
 def spans(count: int, parallel: int, most: int) -> list[range]:
@@ -126,11 +141,14 @@ def spans(count: int, parallel: int, most: int) -> list[range]:
 
 
 def baseline(name: str, observer_task, *, seeds: Sequence[int], threads: int) -> dict[str, Any]:
-    """Score one of `oracle.AGENTS`, which need no training, on `seeds`, through the real primitive."""
+    """Score one of `oracle.AGENTS`, which need no training, on `seeds`, through the real primitive.
+
+    Scenes are passed over as in `evaluate`.
+    """
     options.check_choice("agent", name, oracle.AGENTS)
-    scenes = [observer_task.sample(seed) for seed in seeds]
-    agent = rollout.oracle_agent(observer_task, scenes, seeds, name)
-    return rollout.summary(rollout.run(observer_task, scenes, seeds, agent, threads=threads))
+    usable, scenes = _with_room(observer_task, seeds)
+    agent = rollout.oracle_agent(observer_task, scenes, usable, name)
+    return rollout.summary(_some(rollout.run(observer_task, scenes, usable, agent, threads=threads), seeds))
 
 
 def score_span(
@@ -263,6 +281,8 @@ def write_scores(
     facts = {"agent": agent, "task": config.task.name, "split": split, "seeds": [seeds[0], seeds[-1]]}
     facts |= {"checkpoint": source, "weights": weights}
     writers.write_json(path, {**facts, "device": jax.devices()[0].device_kind, **result, "config": options.to_dict(config)})
+    if without := len(seeds) - result["episodes"]:
+        print(f"{without} of the {len(seeds)} scenes have no free pose for every object: passed over", flush=True)
     score = rollout.with_interval(result["score"], result["interval95"])
     wrong = rollout.counted({cause: count for cause, count in result["first_failures"].items() if cause != "none"})
     print(

@@ -10,6 +10,7 @@ from test_train_step import tiny_config
 
 from lala_jax import build, checkpoint, options, pictures, rollout, scoring, types
 from lala_jax.sim import render, scene
+from lala_jax.sim.tasks import base
 
 SINGLE = ("model.name=single", "model.stages=1", "model.multi_action=false", "model.max_height=true")
 SEEDS = [1, 3, 5]
@@ -51,6 +52,32 @@ def scored(built, *, parallel, strips=0):
         )
     assert said[-1] == (3, 3)
     return summary, drawn, episodes
+
+
+def crowd(monkeypatch, *crowded):
+    """Leave no room in the scenes of some seeds."""
+    real = base.Task.sample
+
+    def sample(self, seed):
+        if seed in crowded:
+            raise base.NoFreePose(f"no free pose in {seed}")
+        return real(self, seed)
+
+    monkeypatch.setattr(base.Task, "sample", sample)
+
+
+def test_scenes_without_room_are_passed_over(built, alone, monkeypatch, tmp_path, capsys):
+    """By policies and the oracle alike, the first and the only one of a chunk among them; the others' scores are what they were."""
+    crowd(monkeypatch, 1, 5)
+    summary, drawn = scoring.evaluate(*built, seeds=SEEDS, parallel=2, threads=1, strips=1)
+    assert summary["per_episode"] == [line for line in alone[0]["per_episode"] if line["seed"] == 3] and summary["episodes"] == 1
+    config, task = tiny_config(*SINGLE), built[2].task
+    assert [line["seed"] for line in scoring.baseline("oracle", task, seeds=SEEDS, threads=1)["per_episode"]] == [3]
+    scoring.write_scores(config, summary, {}, tmp_path, agent="policy", split="val", seeds=SEEDS, source=None, weights=None)
+    assert "2 of the 3 scenes have no free pose for every object: passed over" in capsys.readouterr().out
+    crowd(monkeypatch, *SEEDS)
+    with pytest.raises(base.NoFreePose, match="none of the scenes of seeds 1 to 5 has a free pose"):
+        scoring.baseline("oracle", task, seeds=SEEDS, threads=1)
 
 
 @pytest.mark.parametrize("parallel", [2, 3])  # 2 leaves an episode over, which is padded
