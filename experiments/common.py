@@ -192,6 +192,13 @@ def read_whole(path: pathlib.Path) -> tuple[dict[str, Any], dict[str, dict[str, 
         raise options.OptionsError(text) from error
 
 
+def check_held(path: pathlib.Path, wanted: Mapping[str, Any]) -> None:
+    """Raise OptionsError where a file holds rows that other values of the flags `wanted` made; an older file may not say."""
+    held = read_whole(path)[0]
+    if other := [f"--{name}={held[name]}" for name, value in wanted.items() if held.get(name, value) != value]:
+        raise options.OptionsError(f"{path} holds rows of {' '.join(other)}: give another --out")
+
+
 def outcome(row: Row, run: Callable[[Any], Mapping[str, Any]], own: Mapping[str, Any]) -> dict[str, Any]:
     """Run a row: all its fields but the label."""
     print(f"{row.name}: {row.label}", flush=True)
@@ -237,8 +244,11 @@ def check_task(config, task: str) -> None:
 
 
 def train_seconds(workdir: pathlib.Path) -> float:
-    """Sum up the time that a run's training steps took, as its curve says: compiling is in it, validation not."""
-    taken = {row["step"]: row["seconds_per_step"] for row in writers.read_metrics(workdir / "metrics.jsonl") if "seconds_per_step" in row}
+    """Sum up the time that a run's training steps took, as its curve says: compiling is in it, each time it was started, validation not."""
+    rows = [row for row in writers.read_metrics(workdir / "metrics.jsonl") if "seconds_per_step" in row]
+    if all("seconds" in row for row in rows):
+        return sum(row["seconds"] for row in rows)
+    taken = {row["step"]: row["seconds_per_step"] for row in rows}  # of an older run: it is not told how many steps a mean is of
     return sum((step - before) * taken[step] for before, step in itertools.pairwise([0, *sorted(taken)]))
 
 

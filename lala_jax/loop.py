@@ -144,10 +144,11 @@ def run(
                 jax.block_until_ready((current, metrics))
             if number == first + 1 < total and writer is not None:
                 print(estimate(total - number, time.time() - start), flush=True)
-            if number % log_every == 0 or number == total:
+            leaving = parallel.anywhere(stopped())
+            if number % log_every == 0 or number == total or leaving:
                 values = mean_metrics(seen, last=number)
                 took, count, seen, begin = time.time() - begin, len(seen), [], time.time()
-                values["seconds_per_step"] = took / count
+                values |= {"seconds": took, "seconds_per_step": took / count}
                 bar.update(shown, note=note(values))
                 if writer is not None:
                     writer.scalars(number, values)
@@ -156,7 +157,6 @@ def run(
                     print(f"step {number} of {total}: {note(values)}; {left:.0f} minutes left", flush=True)
                 setup = 0.0
             bar.update(shown, completed=number)
-            leaving = parallel.anywhere(stopped())
             if number % save_every == 0 or number == total or leaving:
                 mean_metrics([metrics], last=number)
                 save(number, current)

@@ -14,6 +14,7 @@ import numpy as np
 import optax
 import pytest
 
+from experiments import common
 from lala_jax import checkpoint, loop, options, pretrain, state, train, writers
 
 CONFIG = options.from_dict({"train": {"rate": 0.5, "log_every": 2}})
@@ -80,6 +81,26 @@ def test_a_step_is_prepared_once_and_only_where_one_is_taken(tmp_path):
     for total in (2, 5, 5):
         go(tmp_path, total, prepared=prepared)
     assert prepared == [0, 2]
+
+
+def test_every_second_of_a_step_is_in_the_curve_however_often_it_was_stopped(tmp_path, monkeypatch):
+    """Compiling takes ten minutes; the steps before a stop, and the few after it, are neither lost nor counted twice."""
+    now = [0.0]
+    monkeypatch.setattr(loop, "time", types.SimpleNamespace(time=lambda: now[0]))
+
+    class Slow(list):
+        def append(self, number):
+            now[0] += 600.0
+
+    def wait(number, run):
+        now[0] += 1.0
+        return False
+
+    for total, stop in ((7, 3), (7, 4), (7, None)):
+        go(tmp_path, total, signal_at=stop, prepared=Slow(), after=wait)
+    rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert [(row["step"], row["loss"]) for row in rows] == [(2, 1.5), (3, 3), (4, 4), (6, 5.5), (7, 7)]
+    assert common.train_seconds(tmp_path) == 3 * 600.0 + 4  # a second after each step but the last before a stop
 
 
 def test_what_is_left_is_told_after_two_steps(tmp_path, capsys, monkeypatch):
