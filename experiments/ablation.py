@@ -82,9 +82,7 @@ def main(
         return {"task": task, "split": "val", **spent, "reference": chosen[0].name}
 
     path = pathlib.Path(out) / f"ablation-{task}.json"
-    held, _ = common.read_whole(path)
-    if other := [f"--{name}={held[name]}" for name, value in spent.items() if held and held[name] != value]:
-        raise options.OptionsError(f"{path} holds rows of {' '.join(other)}: give another --out")
+    common.check_held(path, spent)
     work, before = functools.partial(run, base=base, runs=runs, seeds=seeds), common.recordings([row for row in chosen if row.trains], base)
     done = common.fill(path, chosen, work, finish, config=base, seeds=seeds, launch=launch, before=before)
     print(f"\n{table(done)}\n\n{path}")

@@ -20,10 +20,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments import common
-from lala_jax import build, cluster, compiling, evaluate, options, publish, rollout
+from lala_jax import build, cluster, compiling, evaluate, options, publish, rollout, types
 from lala_jax import checkpoint as checkpoints
-from lala_jax.sim import oracle
-from lala_jax.sim.tasks import base
+from lala_jax.sim import oracle, scene
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,6 +32,13 @@ class World(common.Row):
     stored: str = "float32"
 
 
+def missing(count: int) -> World:
+    """Give the row in which one of `count` cameras is missing, each in its share of the episodes."""
+    told, share = {2: ("two", "half"), 3: ("three", "third"), 4: ("four", "quarter")}.get(count, (f"{count}", f"share of 1/{count}"))
+    parts = tuple((f"camera.missing={k}",) for k in range(count))
+    return World("missing", f"one camera of {told} missing, each in a {share}", parts=parts)
+
+
 MOVED = ("camera.shift=0.03", "camera.turn=3.0")
 ROWS = (
     World("nominal", "as trained"),
@@ -40,7 +46,7 @@ ROWS = (
     World("moved-uncalibrated", "the same, not calibrated", (*MOVED, "camera.calibrate=false")),
     World("noise", "depth noise like a RealSense D415's", ("camera.depth_noise=true",)),
     World("colors", "colours never seen", ("task.colors=uniform",)),
-    World("missing", "one camera of four missing, each in a quarter", parts=tuple((f"camera.missing={k}",) for k in range(4))),
+    missing(4),  # as many as there are: `worlds`
     World("distractors", "two objects that the goal does not show", ("task.distractors=2",)),
     *(World(f"tower-{n}", f"towers of {n}", (f"task.num_objects={n}",), tasks=("tower",)) for n in (3, 4, 6)),
     World("bfloat16", "as trained, weights rounded to bfloat16", stored="bfloat16"),
@@ -55,7 +61,8 @@ def main(
     del workdir
     launch, name, seeds = cluster.launcher(launcher, launcher_options), config.task.name, build.split_seeds(split, start, episodes)
     params, weights = common.load_weights(checkpoint, config)
-    chosen = common.choose(ROWS, rows, name)
+    known = worlds(config)
+    chosen = [row for row in common.choose(known, rows, name) if can_be_built(row, config)]
     paired = {row.name: same_scenes(config, row.configs(config)[0], seeds) for row in chosen}
 
     def finish(done: Sequence[dict[str, Any]], kept: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -68,9 +75,27 @@ def main(
     path = pathlib.Path(out or f"experiments/results/{name}") / f"robustness-{split}.json"
     loaded = params if launch is None else None
     work = functools.partial(run, base=config, checkpoint=checkpoint, weights=weights, seeds=seeds, params=loaded)
-    done = common.fill(path, chosen, work, finish, config=config, seeds=seeds, weights=weights, launch=launch, known=ROWS)
+    done = common.fill(path, chosen, work, finish, config=config, seeds=seeds, weights=weights, launch=launch, known=known)
     print(f"\n{table(done)}\n\n{path}")
     return done
+
+
+def worlds(config) -> list[World]:
+    """Give `ROWS` for the cameras that the config's preset has."""
+    preset = options.check_choice("camera.preset", config.camera.preset, scene.PRESETS)
+    return [missing(len(scene.PRESETS[preset][0])) if row.name == "missing" else row for row in ROWS]
+
+
+def can_be_built(row: World, config) -> bool:
+    """Say whether the task can be as a row wants it, and print why where not: a user's need not have all that the shipped ones have."""
+    build.task(config)
+    try:
+        for one in row.configs(config):
+            build.task(one)
+    except options.OptionsError as error:
+        print(f"{row.name} is left out: {error}", flush=True)
+        return False
+    return True
 
 
 def run(row: World, *, base, checkpoint: str, weights: Mapping[str, Any], seeds: Sequence[int], params: Any = None) -> dict[str, Any]:
@@ -93,18 +118,17 @@ def shares(seeds: Sequence[int], count: int) -> list[list[int]]:
 
 
 def same_scenes(config, other, seeds: Sequence[int]) -> bool:
-    """Say whether the wanted objects of two configs' scenes are the same for every seed; raises where a scene cannot be drawn."""
-    tasks = build.task(config), build.task(other)
-    if tasks[0] == tasks[1]:
+    """Say whether the wanted objects of two configs' scenes are the same for every seed, and the same scenes are passed over."""
+    first, second = build.task(config), build.task(other)
+    if first == second:
         return True
-    pairs = [[_wanted(task, seed) for task in tasks] for seed in seeds]  # every scene is drawn, also after one that differs
-    return all(jax.tree.all(jax.tree.map(np.array_equal, *pair)) for pair in pairs)
+    there, here = ({seed: _wanted(drawn) for seed, drawn in task.roomy(seeds)} for task in (first, second))
+    return there.keys() == here.keys() and jax.tree.all(jax.tree.map(np.array_equal, there, here))
 
 
-def _wanted(task: base.Task, seed: int):
-    scene = task.sample(seed)
-    kept = oracle.wanted(scene)
-    return scene.base, [leaf[kept] for leaf in (scene.size, scene.color, scene.start, scene.goal)]
+def _wanted(drawn: types.Scene):
+    kept = oracle.wanted(drawn)
+    return drawn.base, [leaf[kept] for leaf in (drawn.size, drawn.color, drawn.start, drawn.goal)]
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:

@@ -2,7 +2,9 @@
 
 Trains every row of `ROWS` on the same demonstrations with the same number of samples, scores it on the same episodes of the test split, and
 writes `<scale>-<task>.json` (see `common`; a row has `published`, the paper's number or null, `parameters`, `samples` and `train_seconds`
-besides), `<scale>.md`, a table of both tasks as far as they are there, and `<scale>.webp`, the same as bars, to `--out`. The scales are
+besides, `pretrain_samples` and `pretrain_seconds` where its backbone was pre-trained, and `ran`, fields that were set otherwise than its
+`config` says), `<scale>.md`, a table of both tasks as far as they are there and one of what the rows differ by, and `<scale>.webp`, the
+scores as bars, to `--out`. The scales are
 `smoke` (every part, scores that mean nothing), `cpu` (all from the default agent's pictures and maps, half the paper's in each direction,
 by networks of about as many parameters as ours, pretrained features to the stem only: most rows train in half an hour on two cores) and
 `paper` (the paper's own sizes and number of samples, in bfloat16; for a GPU).
@@ -24,7 +26,7 @@ from typing import Any
 import jax
 
 from experiments import common
-from lala_jax import build, cluster, compiling, options, pretrain, scoring, state, writers
+from lala_jax import build, cluster, compiling, options, pretrain, rollout, scoring, state, writers
 from lala_jax.sim import tasks
 
 
@@ -35,6 +37,7 @@ class Entry(common.Row):
     family: str = "paper"  # of FAMILIES
     agent: str = "policy"  # or one of oracle.AGENTS, which are not trained
     published: tuple[float | None, float | None] = (None, None)  # tower, pallet: score with 500 demonstrations, as published
+    against: str = ""  # the row that it is compared with, scene by scene
     few: bool = False  # learns from FEW demonstrations
     scene: bool = False  # the backbone is first pre-trained in the task's scenes
     extra: str = ""  # of the package, with a module of that name, that the row needs
@@ -52,10 +55,10 @@ ROWS = (
     Entry("ours", "ours, the default agent", family="ours"),
     Entry("single", "LALA single stream", ("model.name=single", *HIDDEN), published=(13.4, 6.0), family="single"),
     Entry("two-stream", "LALA two stream", ("model.name=two_stream", *HIDDEN), published=(15.8, 6.3)),
-    Entry("lateral", "LALA two stream + lateral", ("model.name=two_stream_lateral", *HIDDEN), published=(0.0, 0.0)),
-    Entry("single-visible", "single stream, height slices", ("model.name=single", *VISIBLE), family="single"),
-    Entry("two-stream-visible", "two stream, height slices", ("model.name=two_stream", *VISIBLE)),
-    Entry("lateral-visible", "two stream + lateral, height slices", ("model.name=two_stream_lateral", *VISIBLE)),
+    Entry("lateral", "LALA two stream + lateral", ("model.name=two_stream_lateral", *HIDDEN), published=(0.0, 0.0), against="two-stream"),
+    Entry("single-visible", "single stream, height slices", ("model.name=single", *VISIBLE), family="single", against="single"),
+    Entry("two-stream-visible", "two stream, height slices", ("model.name=two_stream", *VISIBLE), against="two-stream"),
+    Entry("lateral-visible", "two stream + lateral, height slices", ("model.name=two_stream_lateral", *VISIBLE), against="lateral"),
     Entry("transporter", "Transporter (ignores the goal)", ("model.name=transporter", *COLOR), family="transporter"),
     Entry("image-goal", "image-goal Transporter", ("model.name=image_goal", *COLOR), family="goal"),
     Entry("goal-split", "goal-split Transporter", ("model.name=goal_split", *COLOR), family="goal"),
@@ -77,21 +80,33 @@ ROWS = (
         family="clip",
         clip=True,
     ),
-    Entry("graph", "graph policy on true poses", ("model.name=graph",), family="graph"),
-    Entry("two-stream-plain", "two stream, no pretrained features", ("model.name=two_stream", *COLOR)),
-    Entry("two-stream-scene", "two stream, features pre-trained in the scene", ("model.name=two_stream", *HIDDEN), scene=True),
-    Entry("two-stream-50", "two stream, 50 demonstrations", ("model.name=two_stream", *HIDDEN), few=True),
+    Entry("graph", "graph policy on true poses", ("model.name=graph",), family="graph", against="ours"),
+    Entry("two-stream-plain", "two stream, no pretrained features", ("model.name=two_stream", *COLOR), against="two-stream"),
+    Entry(
+        "two-stream-scene",
+        "two stream, features pre-trained in the scene",
+        ("model.name=two_stream", *HIDDEN),
+        scene=True,
+        against="two-stream",
+    ),
+    Entry("two-stream-50", "two stream, 50 demonstrations", ("model.name=two_stream", *HIDDEN), few=True, against="two-stream"),
     Entry(
         "two-stream-scene-50",
         "two stream, features pre-trained in the scene, 50 demonstrations",
         ("model.name=two_stream", *HIDDEN),
+        against="two-stream-50",
         scene=True,
         few=True,
     ),
-    Entry("two-stream-multi", "two stream, every right action", ("model.name=two_stream", *HIDDEN, "model.multi_action=true")),
+    Entry(
+        "two-stream-multi",
+        "two stream, every right action",
+        ("model.name=two_stream", *HIDDEN, "model.multi_action=true"),
+        against="two-stream",
+    ),
     Entry("ours-same-maps", "ours, from the pictures and maps of the paper's agents", family="same"),
-    Entry("ours-one-hot", "ours, one-hot labels", ("model.multi_action=false",), family="ours", revision=1),
-    Entry("ours-no-matching", "ours, no matching between the maps", ("model.matching=false",), family="ours"),
+    Entry("ours-one-hot", "ours, one-hot labels", ("model.multi_action=false",), family="ours", revision=1, against="ours"),
+    Entry("ours-no-matching", "ours, no matching between the maps", ("model.matching=false",), family="ours", against="ours"),
     Entry("blind", "blind: places well, ignores identities", family="computed", agent="blind"),
     Entry("top_view", "sees the goal from right above only, else perfect", family="computed", agent="top_view"),
     Entry("oracle", "oracle", family="computed", agent="oracle"),
@@ -108,7 +123,7 @@ SCALES = {
     "cpu": ("data.demos=500", "train.steps=400", "train.batch_size=8", "eval.episodes=100"),
     "paper": (
         *("data.demos=500", "train.steps=2500", "train.batch_size=8", "train.save_every=1000", "eval.episodes=100", "eval.parallel=4"),
-        *("camera.height=480", "camera.width=640"),
+        *("camera.height=480", "camera.width=640", "pretrain.window=128", "pretrain.patch=16"),
     ),
 }
 FEW = {"smoke": 2, "cpu": 50, "paper": 50}
@@ -168,6 +183,8 @@ def main(
     options.check_choice("--scale", scale, SCALES)
     base = options.override(config, [*shared(config, scale), f"eval.split={split}", f"eval.start={start}", f"seed={seed}"])
     seeds, out_path = build.split_seeds(split, start, base.eval.episodes), pathlib.Path(out)
+    path, place = out_path / f"{scale}-{task}.json", {"split": split, "start": start, "seed": seed}
+    common.check_held(path, place)
     runs = f"{build.workdir(config, workdir)}/{scale}"
     files = tuple(f"model.{name}={path}" for name, path in (("clip", clip), ("clip_tokenizer", clip_tokenizer)) if path)
     chosen = [row for row in common.choose(plan(scale, files), rows, task, reference=False) if can_run(row, files)]
@@ -179,10 +196,9 @@ def main(
 
     def finish(done: Sequence[dict[str, Any]], kept: Sequence[dict[str, Any]]) -> dict[str, Any]:
         del done, kept
-        return {"task": task, "scale": scale, "split": split}
+        return {"task": task, "scale": scale, **place}
 
-    work, path = functools.partial(work_on, base=base, runs=runs, seeds=seeds, task=task), out_path / f"{scale}-{task}.json"
-    before = preparations(chosen, base, runs)
+    work, before = functools.partial(work_on, base=base, runs=runs, seeds=seeds, task=task), preparations(chosen, base, runs)
     done = common.fill(path, chosen, work, finish, config=base, seeds=seeds, launch=launch, before=before)
     write(out_path, scale, seeds, bases(base, scale))
     return done
@@ -248,13 +264,17 @@ def run(row: Entry, base, directory: pathlib.Path, seeds: Sequence[int]) -> dict
         summary = scoring.baseline(row.agent, build.task(config), seeds=seeds, threads=config.data.threads)
         return {**common.row_of(summary), "parameters": None, "samples": 0, "train_seconds": 0.0}
     # One validation, of a few episodes: at the paper's scale as many as the scores then take at once, by the same program.
-    values = config.train.steps, min(config.eval.parallel, 4), 0
-    config = options.override(config, [f"{name}={value}" for name, value in zip(LAST, values, strict=True)])
+    ran, facts = dict(zip(LAST, (config.train.steps, min(config.eval.parallel, 4), 0), strict=True)), {}
+    config.update_from_flattened_dict(ran)
     if row.scene:
-        config.camera.backbone = backbone(config, directory.with_name(directory.name.removesuffix(row.folder) + "backbone"))
+        before = directory.with_name(directory.name.removesuffix(row.folder) + "backbone")
+        config.camera.backbone = backbone(config, before)
+        ran["camera.backbone"] = str(pathlib.Path(config.camera.backbone).relative_to(directory.parent))  # in the runs' directory
+        samples = config.pretrain.steps * config.pretrain.batch_size
+        facts = {"pretrain_samples": samples, "pretrain_seconds": common.train_seconds(before)}
     params = jax.eval_shape(build.build_policy(config).init, jax.random.key(0))
-    facts = {"parameters": state.parameter_count(params), "samples": config.train.steps * config.train.batch_size}
-    return {**common.train_and_score(config, directory), **facts}
+    facts |= {"parameters": state.parameter_count(params), "samples": config.train.steps * config.train.batch_size}
+    return {**common.train_and_score(config, directory), **facts, "ran": ran}
 
 
 def backbone(config, directory: pathlib.Path) -> str:
@@ -300,7 +320,7 @@ def is_fresh(row: Entry, result: Mapping[str, Any], base, seeds: Sequence[int]) 
 def write(out: pathlib.Path, scale: str, seeds: Sequence[int], bases: Mapping[str, Any]) -> None:
     """Write `<scale>.md` and `<scale>.webp` from the results of both tasks, whose rows change `bases`, and print the table."""
     rows = stored(out, scale, seeds, bases)
-    text = table(rows)
+    text = "\n\n".join(part for part in (table(rows), differences(rows)) if part)
     with writers.atomic(out / f"{scale}.md") as file:
         file.write(f"{text}\n".encode())
     try:
@@ -328,9 +348,22 @@ def table(results: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> str:
     return common.table(header, lines)
 
 
+def differences(results: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> str:
+    """Write as a Markdown table what rows score more than those they are `against`, in the same scenes; "" where there are none."""
+    lines, labels = [], {entry.name: entry.label for entry in ROWS}
+    for entry in [entry for entry in ROWS if entry.against]:
+        own = [(rows.get(entry.name), rows.get(entry.against)) for rows in results.values()]
+        if not any(row and other for row, other in own):
+            continue
+        found = [common.difference(row["scores"], other["scores"], paired=True) if row and other else None for row, other in own]
+        texts = [rollout.with_interval(one["mean"], one["interval95"], signed=True) if one else "" for one in found]
+        lines.append([entry.label, labels[entry.against], *texts])
+    return common.table(["", "less the score, in the same scenes, of", *results], lines) if lines else ""
+
+
 def cells(row: Mapping[str, Any]) -> list[str]:
-    """Write a task's part of a row."""
-    cost = f"{row['train_seconds']:.0f}" if row["train_seconds"] else ""
+    """Write a task's part of a row; what its backbone took beforehand is added to the time, where that is known."""
+    cost = " + ".join(f"{row[name]:.0f}" for name in ("train_seconds", "pretrain_seconds") if row.get(name))
     return [*common.cells(row)[1:], cost, "" if row["published"] is None else f"{row['published']:.1f}"]
 
 

@@ -15,7 +15,9 @@ from test_train_step import tiny_config
 
 from experiments import ablation, common, main_table, robustness, table1
 from lala_jax import build, checkpoint, observe, options, rollout, train, writers
-from lala_jax.sim import tasks
+from lala_jax.sim import scene, tasks
+from lala_jax.sim.tasks import base as task_base
+from lala_jax.sim.tasks import tower
 
 SEEDS = [1, 3, 5]
 
@@ -81,8 +83,8 @@ def test_every_row_of_the_table_builds(task, scale, unseen):
             assert config.data.demos == (table1.FEW[scale] if row.few else base.data.demos) and config.seed == base.seed
     others = sum(row.agent == "policy" and not row.scene and not row.clip for row in rows)
     assert len(built) == others  # no row is another one's double, but for where its backbone or its trunk comes from
-    samples = {config.train.steps * config.train.batch_size for config in (row.configs(base)[0] for row in rows)}
-    assert scale == "smoke" or len(samples - {shipped(task).train.steps * 8}) == 1
+    budgets = {(config.train.steps, config.train.batch_size) for config in (row.configs(base)[0] for row in rows)}
+    assert budgets == {(base.train.steps, base.train.batch_size)}
 
 
 def test_rows_are_chosen_by_name():
@@ -276,6 +278,36 @@ def test_which_worlds_have_the_same_scenes():
     assert {name for name, found in same.items() if not found} == {"colors", "tower-3", "tower-4", "tower-6"}
 
 
+def test_scenes_that_are_passed_over_in_one_world_only_are_not_the_same(monkeypatch):
+    config, real = tiny_config(), task_base.Task.sample
+    other = options.override(config, ["task.distractors=1"])
+    for crowded, same in (({0, 1}, True), ({0}, False), ({1}, False)):  # distractors of the worlds in which a scene has no room
+
+        def sample(self, seed, crowded=crowded):
+            if seed == SEEDS[1] and self.distractors in crowded:
+                raise task_base.NoFreePose("no free pose")
+            return real(self, seed)
+
+        monkeypatch.setattr(task_base.Task, "sample", sample)
+        assert robustness.same_scenes(config, other, SEEDS) is same
+
+
+def test_worlds_that_a_users_task_or_cameras_lack(monkeypatch, capsys):
+    """A task without distractors, three cameras instead of four."""
+    rows = {row.name: row for row in robustness.worlds(shipped("tower"))}
+    assert list(rows.values()) == list(robustness.ROWS) and all(robustness.can_be_built(row, shipped("tower")) for row in rows.values())
+    monkeypatch.setitem(scene.PRESETS, "three", (scene.PRESETS["ring"][0][:3], scene.PRESETS["ring"][1]))
+    rows = {row.name: row for row in robustness.worlds(options.override(shipped("tower"), ["camera.preset=three"]))}
+    assert rows["missing"].parts == (("camera.missing=0",), ("camera.missing=1",), ("camera.missing=2",))
+    assert rows["missing"].label == "one camera of three missing, each in a third"
+    monkeypatch.setattr(tower.TowerTask, "build_distractors", task_base.Task.build_distractors)
+    assert [row.name for row in robustness.ROWS if not robustness.can_be_built(row, shipped("tower"))] == ["distractors"]
+    assert "distractors is left out: task tower has no build_distractors" in capsys.readouterr().out
+    monkeypatch.delitem(scene.PRESETS, "three")
+    with pytest.raises(options.OptionsError, match=r"camera.preset must be one of 'ring', 'paper', got 'three'"):
+        robustness.worlds(options.override(shipped("tower"), ["camera.preset=three"]))
+
+
 def test_training_seconds_are_those_of_the_curve(tmp_path):
     with writers.Writer(tmp_path, tensorboard=False) as writer:
         for step, seconds in [(10, 3.0), (20, 1.0), (30, 1.0), (20, 2.0), (35, 1.0)]:  # stopped after 30, gone on from 10
@@ -365,6 +397,8 @@ def test_the_table_holds_every_row_of_both_tasks(trains, monkeypatch, tmp_path, 
     assert config.task.name == "tower" and config.model.max_height and not config.model.multi_action and config.camera.backbone
     text = (tmp_path / "smoke.md").read_text()
     assert text.strip() in capsys.readouterr().out
+    text, _, differences = text.partition("\n\n")
+    assert "| graph policy on true poses | ours, the default agent |  | +0.0 [" in differences
     header, _, *lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines()]
     assert header == ["", "parameters", "tower", "complete", "training, s", "published", "pallet", "complete", "training, s", "published"]
     named = {line[0]: line[1:] for line in lines}
@@ -372,6 +406,11 @@ def test_the_table_holds_every_row_of_both_tasks(trains, monkeypatch, tmp_path, 
     assert named["LALA two stream"][4] == "15.8" and named["LALA two stream"][5:] == [""] * 4
     assert named["blind: places well, ignores identities"][1:5] == [""] * 4  # of the tower it was not asked for
     assert len(table1.command([*given, "--rows=two-stream"])) == 1 and len(trains) == 3  # nothing runs again
+    held = (tmp_path / "smoke-tower.json").read_bytes()
+    with pytest.raises(SystemExit, match="2"):
+        table1.command([*given, "--rows=two-stream", "--seed=1", "--split=val"])
+    assert "smoke-tower.json holds rows of --split=test --seed=0: give another --out" in capsys.readouterr().err
+    assert (tmp_path / "smoke-tower.json").read_bytes() == held and len(trains) == 3
     path = tmp_path / "smoke-pallet.json"
     older = json.loads(path.read_text())
     older["rows"][0]["overrides"][0].append("model.width=9")
@@ -382,6 +421,44 @@ def test_the_table_holds_every_row_of_both_tasks(trains, monkeypatch, tmp_path, 
     assert "left out of the table, as they are of other settings or seeds: blind, graph, ours in " in capsys.readouterr().out
     named = [line.split("|")[1].strip() for line in (tmp_path / "smoke.md").read_text().splitlines()[2:]]
     assert named == [entry.label for entry in table1.ROWS if entry.name in ("two-stream", "top_view")]
+
+
+def test_a_row_says_what_it_ran_and_what_its_backbone_cost(trains, monkeypatch, tmp_path):
+    def fake(config, workdir):
+        with writers.Writer(workdir, tensorboard=False) as writer:
+            writer.scalars(config.pretrain.steps, {"seconds_per_step": 5.0})
+        return f"{workdir}/backbone.npz"
+
+    monkeypatch.setattr(table1.pretrain, "pretrain", fake)
+    (row,) = table1.command(["--scale=smoke", "--rows=two-stream-scene", f"--workdir={tmp_path / 'runs' / '<task>'}", f"--out={tmp_path}"])
+    ((directory, config),) = trains
+    assert directory == str(tmp_path / "runs/tower/smoke-two-stream-scene")
+    ran = options.fields(options.to_dict(config)) | {"camera.backbone": "smoke-backbone/backbone.npz"}
+    assert config.camera.backbone == f"{tmp_path}/runs/tower/smoke-backbone/backbone.npz"
+    assert options.fields(row["config"]) | row["ran"] == writers.plain(ran)
+    assert (row["pretrain_samples"], row["pretrain_seconds"], row["samples"], row["train_seconds"]) == (4, 10.0, 4, 4.0)
+    assert "| 4 + 10 |" in (tmp_path / "smoke.md").read_text()
+
+
+def test_differences_are_of_the_same_scenes():
+    first, second, third = (
+        {"scores": dict(zip("abc", scores, strict=True))} for scores in ([0.0, 10.0, 15.0], [10.0, 30.0, 20.0], [1.0] * 3)
+    )
+    found = table1.differences({"tower": {"single": first, "single-visible": second}, "pallet": {"single-visible": third}})
+    mean, half = 35 / 3, 1.96 * np.std([10, 20, 5], ddof=1) / math.sqrt(3)
+    own = f"{mean:+.1f} [{mean - half:+.1f}, {mean + half:+.1f}]"
+    assert found.splitlines()[2:] == [f"| single stream, height slices | LALA single stream | {own} |  |"]
+    assert table1.differences({"tower": {"single": first, "lateral": third}}) == ""
+
+
+def test_rows_are_compared_with_others_that_have_what_they_are_compared_in():
+    rows = {row.name: row for row in table1.ROWS}
+    compared = [row for row in table1.ROWS if row.against]
+    assert {row.name for row in compared} >= {name for name in rows if name.startswith(("ours-one", "ours-no", "two-stream-"))}
+    for row in compared:
+        other = rows[row.against]
+        assert set(row.tasks) <= set(other.tasks or tasks.names()) and not other.tasks and other.agent == row.agent == "policy"
+        assert row.family == other.family or row.name == "graph"
 
 
 def bases():
