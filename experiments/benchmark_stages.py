@@ -19,7 +19,22 @@ import optax
 
 from experiments import timing
 from experiments.benchmark_targets import EPISODES
-from lala_jax import build, checkpoint, compiling, losses, options, policy, recording, rollout, scoring, state, train, train_step, types
+from lala_jax import (
+    build,
+    checkpoint,
+    compiling,
+    losses,
+    options,
+    policy,
+    pretrained,
+    recording,
+    rollout,
+    scoring,
+    state,
+    train,
+    train_step,
+    types,
+)
 from lala_jax.models import correlation, transporter
 from lala_jax.perception import topdown
 from lala_jax.sim import oracle, physics, render, robot, scene
@@ -263,6 +278,8 @@ def collection(config) -> timing.Work:
 
 def evaluation(config) -> timing.Work:
     """Run the closed loop with the weights that ship, a quarter of EPISODES at once."""
+    if config.task.name not in pretrained.names():
+        raise timing.Unavailable(f"needs weights of {config.task.name} in the package, which has {', '.join(pretrained.names())}")
     path = f"pretrained/{config.task.name}"
     agent, observer = build.build_policy(config), build.observer(config)
     params = scoring.check_checkpoint(path, config, agent)

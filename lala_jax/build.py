@@ -40,6 +40,7 @@ SPLITS = ("train", "val", "test")
 TEST_START = 10_001
 WORKDIR = "runs/<task>"  # the default of --workdir
 SELECTION_START = 4000  # the place in the val split from which episodes choose the best checkpoint: far from those reported
+FILES = {"surface": ("camera.backbone",), "clip": ("model.clip", "model.clip_tokenizer")}  # by the input spec's entry that knows them
 USER_ERRORS = (dataset.DatasetError, checkpoint.CheckpointError, base.NoFreePose, parallel.PeerError)  # their messages say all
 
 

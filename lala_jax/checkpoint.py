@@ -92,8 +92,8 @@ class Checkpoints:
         """Give `(step, state)` of the newest intact step, or None where nothing was saved yet.
 
         `template` is a pytree of arrays or `jax.ShapeDtypeStruct`; the state has its structure, and its shardings where it has
-        any. Damaged steps are logged and passed over. Raises MismatchError naming the leaf, the stored and the expected shape
-        and dtype; CheckpointError where steps exist and none is intact, or where processes do not see the same steps.
+        any. Damaged steps are logged and passed over, in all processes alike. Raises MismatchError naming the leaf, the stored and the
+        expected shape and dtype; CheckpointError where steps exist and none is intact, or where processes do not see the same steps.
         """
         folder = self.directory / "latest"
         steps = _steps(folder)
@@ -103,6 +103,9 @@ class Checkpoints:
             return None
 
         def read(folder: pathlib.Path, step: int) -> tuple[int, Any]:
+            problem = _problem(folder, step)
+            if parallel.anywhere(bool(problem)):  # all read it, or none
+                raise CheckpointError(problem or f"{folder / str(step)}, which another process cannot read")
             return step, _restore(folder, step, template)
 
         return _first_intact(f"in {folder}", [(folder, step) for step in steps], read, damaged=self._damaged)
@@ -339,6 +342,17 @@ def _restore(folder: pathlib.Path, step: int, template: Any) -> Any:
         return nest(leaves)
     placed = [_place(leaves[name], leaf) for name, leaf in named(template).items()]
     return jax.tree_util.tree_unflatten(jax.tree_util.tree_structure(template), placed)
+
+
+def _problem(folder: pathlib.Path, step: int) -> str:
+    """Say what is wrong with a step before it is read, "" where nothing is; of a single process its reading will tell."""
+    if jax.process_count() == 1:
+        return ""
+    try:
+        _check_files(folder / str(step), _read_side(folder, step))
+    except CheckpointError as error:
+        return str(error)
+    return ""
 
 
 def _check_files(path: pathlib.Path, side: Mapping[str, Any]) -> None:

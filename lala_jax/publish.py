@@ -4,7 +4,8 @@
         --out=lala_jax/weights/tower
 
 Several score files are separated by commas; `lala_jax.evaluate --checkpoint=pretrained/tower` repeats the first. `--dtype=bfloat16` halves
-the size. `--robustness=experiments/results/tower/robustness-test.json` adds a table of scores in other worlds.
+the size. `--robustness=experiments/results/tower/robustness-test.json` adds a table of scores in other worlds. What is not known of
+demonstrations that the oracle did not record must be said: `--data="400 of our UR5e, by hand, and 100 of the oracle in simulation"`.
 """
 
 from __future__ import annotations
@@ -28,12 +29,12 @@ README = "README.md"
 SCORE = ("episodes", "score", "interval95", "complete_percent")
 
 
-def main(config, workdir, *, checkpoint: str, scores: str, out: str, dtype: str, robustness: str) -> None:
+def main(config, workdir, *, checkpoint: str, scores: str, out: str, dtype: str, robustness: str, data: str) -> None:
     """Write weights.npz, card.json and README.md to the directory `--out`."""
     del workdir
     if options.to_dict(config) != options.to_dict(stored_config({"checkpoint": checkpoint, "scores": scores, "out": out})):
         raise options.OptionsError("the config of published weights is that of their checkpoint: leave --config out")
-    card = publish(checkpoint, scores.split(","), out, dtype=dtype, robustness=robustness or None)
+    card = publish(checkpoint, scores.split(","), out, dtype=dtype, robustness=robustness or None, data=data)
     size = (pathlib.Path(out) / pretrained.ARRAYS).stat().st_size
     print(f"{out}: {card['parameters']:,} parameters, {dtype}, {size / 1e6:.1f} MB; check with\n{card['commands']['evaluate']}")
 
@@ -47,12 +48,13 @@ def stored_config(flags: Mapping[str, Any]):
 
 
 def publish(
-    source: str, score_files: Sequence[str], out: str | os.PathLike[str], *, dtype: str = "float32", robustness: str | None = None
-) -> dict[str, Any]:
+    source: str, score_files: Sequence[str], out: str | os.PathLike[str], *, dtype: str = "float32", robustness: str | None = None,
+    data: str = "",
+) -> dict[str, Any]:  # fmt: skip
     """Write the three files of a checkpoint to `out`, all or none, and give the card.
 
-    Raises OptionsError on scores of another checkpoint, model or world and where `out` holds something else, CheckpointError on
-    a checkpoint that cannot be read or published.
+    `data` says where the demonstrations are from, unless the oracle recorded them all. Raises OptionsError on scores of another
+    checkpoint, model or world and where `out` holds something else, CheckpointError on a checkpoint that cannot be read or published.
     """
     options.check_choice("--dtype", dtype, pretrained.STORED)
     out = pathlib.Path(out)
@@ -72,7 +74,7 @@ def publish(
         "dtype": dtype,
         "parameters": state.parameter_count(params),
         "step": facts["step"],
-        "data": _data(config),
+        "data": _data(config) | ({"source": data} if data else {}),
         "training": {"seed": config["seed"], "steps": config["train"]["steps"], "selection": _selection(config)},
         "commands": {"train": training_command(config), "evaluate": _evaluation_command(out)},
         "scores": rows,
@@ -244,6 +246,17 @@ def model_card(card: Mapping[str, Any]) -> str:
     camera, model = card["config"]["camera"], card["config"]["model"]
     more = f", and {data['distractors']} objects that the goal does not show" if data["distractors"] else ""
     spoiled = f" {data['mistakes']:.0%} of their actions are spoiled, so that they show how to recover." if data["mistakes"] else ""
+    frozen = _pretrained(card["config"])
+    if "source" not in data:
+        demonstrations = f"{data['demonstrations']} demonstrations of the scripted oracle in simulation; no other data, {frozen}.{spoiled}"
+        demonstrations += f" Their seeds: {data['seeds']}."
+        seen = "Simulation only: never run on a robot or on pictures of real cameras."
+        lacks = (
+            " For a misplaced object, the demonstrations " + ("show few ways" if data["mistakes"] else "never show how") + " to recover."
+        )
+    else:
+        demonstrations = f"{data['demonstrations']} demonstrations: {data['source']}; {frozen}."
+        seen, lacks = "The scores are of simulation only.", ""
     scores = [
         f"| {row['split']} | {row['seeds'][0]} to {row['seeds'][1]} | {row['episodes']} | {_score(row)} | `{row['file']}` |"
         for row in card["scores"]
@@ -266,18 +279,15 @@ def model_card(card: Mapping[str, Any]) -> str:
         "```bash\n" + card["commands"]["evaluate"] + "\n```",
         "repeats the first score below and says whether it is the same.",
         "## Data and training",
-        f"{data['demonstrations']} demonstrations of the scripted oracle in simulation; no other data, {_pretrained(card['config'])}."
-        f"{spoiled} Their "
-        f"seeds: {data['seeds']}. Training seed {training['seed']}. The checkpoint was chosen by {training['selection']}.",
+        f"{demonstrations} Training seed {training['seed']}. The checkpoint was chosen by {training['selection']}.",
         "```bash\n" + card["commands"]["train"] + "\n```",
         "## Scores",
         "Share of objects at their goal when the episode ends, 0 to 100, with the 95% interval over episodes.",
         "\n".join(["| split | seeds | episodes | score | complete | file |", "|---|---|---|---|---|---|", *scores]),
         *_other_worlds(card["robustness"]),
         "## Limits",
-        "Simulation only: never run on a robot or on pictures of real cameras. Objects are upright boxes, actions are vertical. One "
-        "training seed: the intervals do not say how much another training would differ. For a misplaced object, the demonstrations "
-        + ("show few ways to recover." if data["mistakes"] else "never show how to recover."),
+        f"{seen} Objects are upright boxes, actions are vertical. One training seed: the intervals do not say how much another training "
+        f"would differ.{lacks}",
         "## Licence",
         f"{card['licence']}, as the code.",
     ]
@@ -303,7 +313,7 @@ def _score(row: Mapping[str, Any]) -> str:
 if __name__ == "__main__":
     options.run(
         main,
-        flags={"checkpoint": "", "scores": "", "out": "", "dtype": "float32", "robustness": ""},
+        flags={"checkpoint": "", "scores": "", "out": "", "dtype": "float32", "robustness": "", "data": ""},
         config_from=stored_config,
         workdir=build.WORKDIR,
         user_errors=build.USER_ERRORS,

@@ -51,9 +51,17 @@ def fresh(recipe: train_step.Recipe, seed: int) -> state.TrainState:
 
 
 def start_or_resume(config: Mapping[str, Any], recipe: train_step.Recipe, store: checkpoint.Checkpoints) -> state.TrainState:
-    """Make a fresh state, or restore the newest intact one; raises CheckpointError where it is of a run with other settings."""
+    """Make a fresh state, or restore the newest intact one; raises CheckpointError where it is of a run with other settings.
+
+    Files of pretrained weights may have been moved meanwhile: what is in them counts.
+    """
     begun, frozen = fresh(recipe, config["seed"]), build.clip_identity(config) | build.backbone_identity(config)
-    return loop.start_or_resume(begun, store, config, build.run_settings, frozen, mesh=recipe.mesh, shard=recipe.shard_state)
+    files = {field for name in frozen for field in build.FILES[name]}
+
+    def settings(config: Mapping[str, Any]) -> dict[str, Any]:
+        return {name: value for name, value in build.run_settings(config).items() if name not in files}
+
+    return loop.start_or_resume(begun, store, config, settings, frozen, mesh=recipe.mesh, shard=recipe.shard_state)
 
 
 def train_and_evaluate(config, workdir: str) -> dict[str, Any]:

@@ -170,6 +170,23 @@ def processes(directory):
         raise AssertionError("two directories were taken for one")
     except checkpoint.CheckpointError as error:
         assert "all processes share" in str(error)
+    several, real, lost = checkpoint.Checkpoints(directory / "several"), checkpoint._check_files, {"2"}
+    for step in (1, 2):
+        several.save_latest(step, double, **STORED)
+
+    def check(path, side):
+        if mine == 1 and path.name in lost:
+            raise checkpoint.CheckpointError(f"{path} is damaged: disk error")
+        real(path, side)
+
+    checkpoint._check_files = check  # one process cannot read what the other can
+    assert several.restore_latest(double)[0] == 1
+    lost.add("1")
+    try:
+        several.restore_latest(double)
+        raise AssertionError("a process went on by itself")
+    except checkpoint.CheckpointError as error:
+        assert "no intact checkpoint in" in str(error) and ("disk error" if mine else "another process cannot read") in str(error)
     (directory / f"done-{mine}").touch()
 
 

@@ -70,13 +70,17 @@ def pair(params, name, x, stride=1, last_relu=True):
     return x
 
 
-def hourglass(params, x, stages):
-    """Pass a `blocks.ResNet43_8s`."""
+def hourglass(params, x, stages, laterals=None, decoded=None):
+    """Pass a `blocks.ResNet43_8s`; take in `laterals`, another one's decoder features, and add its own to the list `decoded`."""
     x = relu(conv(np.asarray(x, np.float64), params["stem"]))
     for stage in range(stages):
         x = pair(params, f"down{stage}", x, 2 if stage else 1)
     for stage in reversed(range(stages - 1)):
         x = upsample(pair(params, f"up{stage}", x))
+        if laterals is not None:
+            x = conv(np.concatenate([x, laterals[stages - 2 - stage]], -1), params[f"lateral{stage}"])
+        if decoded is not None:
+            decoded.append(x)
     return pair(params, "head", x, last_relu=False)
 
 

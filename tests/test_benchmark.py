@@ -101,6 +101,9 @@ def test_a_stage_runs_apart_from_the_others_where_it_is_asked_for(monkeypatch):
     assert timing.timed("a", stages, None, 1, apart=True)["alone"] == "a" and "alone" not in timing.timed("a", stages, None, 1)
     elsewhere = {"a": timing.Stage("a thing", "thing", pytest.fail, platform="tpu")}
     assert timing.timed("a", elsewhere, None, 1, apart=True)["unavailable"] == "needs a TPU"
+    monkeypatch.setattr(benchmark_stages.pretrained, "names", lambda: ["pallet"])  # a user's task has none
+    row = timing.timed("evaluate", benchmark_stages.STAGES, tiny_config(), 1)
+    assert row["unavailable"] == "needs weights of tower in the package, which has pallet" and "failed" not in row
     monkeypatch.setattr(timing, "alone", lambda name, *_: {"seconds": 1.0, "name": name})
     found = benchmark_stages.grow("cells", None, 1, apart=True)
     assert [row["name"] for row in found["rows"]] == ["cells=80", "cells=160", "cells=320", "cells=640"]

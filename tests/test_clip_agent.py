@@ -7,7 +7,9 @@ import dataclasses
 import functools
 import json
 import pathlib
+import shutil
 import sys
+import types
 
 import clip_reference
 import clip_tokens
@@ -23,7 +25,7 @@ from test_train_step import tiny_config
 
 import lala_jax
 from experiments import table1
-from lala_jax import build, checkpoint, loop, observe, options, policy_cliport, scoring, state, writers
+from lala_jax import build, checkpoint, loop, observe, options, policy_cliport, scoring, state, train, writers
 from lala_jax.models import transporter
 from lala_jax.perception import topdown
 
@@ -203,6 +205,22 @@ def test_a_checkpoint_is_evaluated_and_continued_with_its_own_towers(files, tmp_
     assert loop.start_or_resume(run, store, config, build.run_settings, build.clip_identity(config))["w"].shape == (2,)
     with pytest.raises(checkpoint.CheckpointError, match=r"holds a run with another clip.crc32 \(\d+ there, \d+ here\)"):
         loop.start_or_resume(run, store, config, build.run_settings, build.clip_identity(other))
+
+
+def test_a_run_goes_on_where_its_files_were_moved(files, monkeypatch, tmp_path):
+    config, moved = tiny_config(*CLIPORT, *files), []
+    for text in files:
+        field, _, path = text.partition("=")
+        moved.append(f"{field}={shutil.copy(path, tmp_path)}")
+    store, run = checkpoint.Checkpoints(tmp_path / "store"), {"w": jnp.ones(2)}
+    store.save_latest(3, run, config=options.to_dict(config), input_spec=build.input_spec(config))
+    monkeypatch.setattr(train, "fresh", lambda recipe, seed: run)
+    recipe = types.SimpleNamespace(mesh=None, shard_state=False)
+    assert train.start_or_resume(options.override(config, moved), recipe, store)["w"].shape == (2,)
+    safetensors.save_file(tensors() | {"visual.bn1.bias": np.ones(2, np.float32)}, tmp_path / "other.safetensors")
+    other = [f"model.clip={tmp_path / 'other.safetensors'}", moved[1]]
+    with pytest.raises(checkpoint.CheckpointError, match=r"holds a run with another clip.crc32 \(\d+ there, \d+ here\): choose"):
+        train.start_or_resume(options.override(config, other), recipe, store)
 
 
 def test_configs_older_than_the_fields_are_of_the_same_run():

@@ -81,6 +81,7 @@ def test_publishing_again_gives_the_same_files(run, published):
     assert set(before) == {"weights.npz", "card.json", "README.md"}
     publish.publish(str(run[0]), [str(run[1])], published)
     assert contents(published) == before
+    assert "source" not in json.loads(before["card.json"])["data"]
     scored(options.from_dict(pretrained.describe(published)["config"]), published, published.parent / "eval")
     publish.publish(str(published), [str(published.parent / "eval" / "scores-policy-test.json")], published)
     assert (published / "weights.npz").read_bytes() == before["weights.npz"]
@@ -343,6 +344,10 @@ def test_the_card_names_what_others_trained():
     ):
         config = {**card["config"], **{group: card["config"][group] | own for group, own in changes.items()}}
         assert told in publish.model_card(card | {"config": config})
+    text = publish.model_card(card | {"data": card["data"] | {"source": "by hand, on our UR5e"}})
+    assert f"{card['data']['demonstrations']} demonstrations: by hand, on our UR5e; no pretrained parts. Training seed" in text
+    assert not [words for words in ("oracle", "never run", "never show", "no other data") if words in text]
+    assert "of simulation only" in text
 
 
 def test_the_weights_in_the_package_are_whole():

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import reference
 
 from lala_jax.models import blocks, streams
 
@@ -73,6 +74,19 @@ def test_only_laterals_let_the_images_meet_before_the_sum(variant, mixes):
     apply = jax.jit(net.apply)
     effect = [apply(params, other, seen) - apply(params, current, seen) for seen in (goal, -goal)]
     assert np.allclose(*effect, atol=1e-5) != mixes
+
+
+@pytest.mark.parametrize("fusion", streams.FUSIONS)
+def test_laterals_lead_from_the_current_stream_into_the_goals(fusion):
+    """Level by level, coarse to fine, against NumPy in float64."""
+    net = streams.Streams(2, "two_stream_lateral", fusion, width=4, stages=3)
+    current, goal = np.random.default_rng(0).normal(size=(2, 8, 12, 3)).astype(np.float32)
+    params = jax.jit(net.init)(jax.random.key(1, impl="rbg"), current, goal)
+    leaves, decoded = params["params"], []
+    first = reference.hourglass(leaves["current"], current, 3, decoded=decoded)
+    second = reference.hourglass(leaves["goal"], goal, 3, laterals=decoded)
+    want = first + second if fusion == "add" else reference.conv(np.concatenate([first, second], -1), leaves["fuse"])
+    np.testing.assert_allclose(jax.jit(net.apply)(params, current, goal), want, atol=1e-5)
 
 
 @pytest.mark.parametrize("variant, fusion", list(itertools.product(streams.VARIANTS, streams.FUSIONS)))
