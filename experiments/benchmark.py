@@ -48,8 +48,9 @@ def main(config, workdir, *, task: str, stages: str, growth: bool, repeats: int,
     every, ceilings = benchmark_stages.STAGES, benchmark_stages.CEILINGS
     known = [name for name in every if name not in ceilings]
     wanted = [options.check_choice("--stages", name, known) for name in stages.split(",") if name] or known
-    before = read(against) if against else None
-    here = machine()
+    before, here = read(against) if against else None, machine()
+    if before is not None:
+        check_comparable(before, {"task": task, **here}, wanted)
     kind = "".join(letter if letter.isalnum() else "-" for letter in here["device"].lower())
     path = pathlib.Path(out) / f"{kind}-{task}.json"
     if path.exists():
@@ -101,9 +102,17 @@ def machine() -> dict[str, Any]:
         "device": device.device_kind,
         "devices": jax.device_count(),
         "processors": os.cpu_count(),
+        "processor": processor(),
         "system": f"{platform.system()} {platform.machine()}, Python {platform.python_version()}",
         "versions": {name: importlib.metadata.version(name) for name in (*LIBRARIES, *extras)},
     }
+
+
+def processor() -> str:
+    """Name the model of the CPU, as Linux tells it, else as Python does."""
+    info = pathlib.Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else []
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.processor())
 
 
 # Tables and comparisons
@@ -150,11 +159,22 @@ def read(path: str, flag: str = "--against") -> dict[str, Any]:
         raise options.OptionsError(f"{flag}={path} is no file of this benchmark: {type(error).__name__} {error}") from error
 
 
+def check_comparable(before: Mapping[str, Any], now: Mapping[str, Any], names: Sequence[str]) -> None:
+    """Raise OptionsError where an earlier file is of another task or machine, or has no time of any stage in `names`.
+
+    An older file does not name its processor.
+    """
+    there, here = (f"{one['task']} on {one['device']}" for one in (before, now))
+    if there == here and before.get("processor", now["processor"]) != now["processor"]:
+        there, here = before["processor"], now["processor"]
+    if there != here:
+        raise options.OptionsError(f"--against holds {there}, this is {here}: their ratio says nothing")
+    if not {row["name"] for row in before["stages"] if "seconds" in row} & set(names):
+        raise options.OptionsError(f"--against holds times of none of the stages {', '.join(names)}")
+
+
 def slower(before: Mapping[str, Any], after: Mapping[str, Any], limit: float) -> list[str]:
     """Print the ratio of each stage's medians, after to before, and name the stages above `limit` and those that no longer run."""
-    if before["device"] != after["device"] or before["task"] != after["task"]:
-        there, here = (f"{one['task']} on {one['device']}" for one in (before, after))
-        raise options.OptionsError(f"--against holds {there}, this is {here}: their ratio says nothing")
     old = {row["name"]: row["seconds"] for row in before["stages"] if "seconds" in row}
     lost = {row["name"]: row["unavailable"] for row in after["stages"] if row.get("failed") and row["name"] in old}
     ratios = {row["name"]: row["seconds"] / old[row["name"]] for row in after["stages"] if "seconds" in row and row["name"] in old}

@@ -83,10 +83,11 @@ def render_views(config) -> timing.Work:
     return timing.compiled(jax.vmap(observer.views), drawn.size, drawn.color, drawn.base, poses, count=BATCH)
 
 
-def render_mujoco(config) -> timing.Work:
-    """Render colour and depth of the same views with MuJoCo, the arm parked."""
+def render_mujoco(config, *, samples: int) -> timing.Work:
+    """Render colour and depth of the same views with MuJoCo, the arm parked, by some `samples` a pixel, 0 for one."""
     task, cameras = build.task(config), build.observer(config).camera
     model = scene.build_model(task, task.sample(1), cameras=cameras)
+    model.vis.quality.offsamples = samples
     data = mujoco.MjData(model)
     robot.Arm(model).reset(data)
     mujoco.mj_forward(model, data)
@@ -283,12 +284,13 @@ def evaluation(config) -> timing.Work:
     path = f"pretrained/{config.task.name}"
     agent, observer = build.build_policy(config), build.observer(config)
     params = scoring.check_checkpoint(path, config, agent)
-    seeds, parallel = build.split_seeds("val", 0, EPISODES), max(EPISODES // 4, 1)
+    parallel = max(EPISODES // 4, 1)
 
-    def run():
+    def close_the_loop(start: int, count: int):
+        seeds = build.split_seeds("val", start, count)
         scoring.evaluate(agent, params, observer, seeds=seeds, parallel=parallel, threads=config.data.threads)
 
-    return timing.Work(run, EPISODES, cold=True)
+    return timing.Work(lambda: close_the_loop(0, EPISODES), EPISODES, cold=True, more=lambda: close_the_loop(EPISODES, parallel))
 
 
 def trained_state(config) -> tuple[state.TrainState, dict[str, Any]]:
@@ -336,6 +338,7 @@ def first_step(config, *, cached: bool) -> timing.Work:
     return timing.Work(run, close=folder.cleanup)
 
 
+TORCH: dict[str, Any] = {"alone": True, "needs": ("torch",), "platform": "cpu"}
 CEILINGS = {"matmul": "flops", "copy": "bytes"}
 LARGE = {"model.dtype": "bfloat16", "train.batch_size": 8}  # how a GPU takes the paper's step
 STAGES = {
@@ -351,9 +354,19 @@ STAGES = {
     "first-step": timing.Stage("from starting Python to the first training step", "start", functools.partial(first_step, cached=False)),
     "first-step-cached": timing.Stage("the same with programs kept from before", "start", functools.partial(first_step, cached=True)),
     "render": timing.Stage("render 4 views of 640 x 480", "observation", lambda config: render_views(full_size(config))),
-    "render-mujoco": timing.Stage(
-        "the same with mujoco.Renderer", "observation", lambda config: render_mujoco(full_size(config)), alone=True, environment=EGL
-    ),
+    **{
+        name: timing.Stage(
+            f"the same with mujoco.Renderer, {told}",
+            "observation",
+            lambda config, samples=samples: render_mujoco(full_size(config), samples=samples),
+            alone=True,
+            environment=EGL,
+        )
+        for name, samples, told in (
+            ("render-mujoco", 0, "one sample a pixel, as ours"),
+            ("render-mujoco-smooth", 4, "four samples, as it does unless told"),
+        )
+    },
     "fuse": timing.Stage("unproject and fuse them", "observation", lambda config: fuse(full_size(config))),
     "observe": timing.Stage("render, unproject and fuse", "observation", lambda config: observe(full_size(config))),
     "observe-many": timing.Stage("the same, batch 64", "observation", lambda config: observe(full_size(config), count=64), platform="gpu"),
@@ -362,7 +375,7 @@ STAGES = {
     "act": timing.Stage("act", "action", act),
     "correlate": timing.Stage("correlation and its gradient, in the spectrum", "sample", lambda config: correlate(config, method="fft")),
     "correlate-direct": timing.Stage("the same directly", "sample", lambda config: correlate(config, method="conv"), alone=True),
-    "correlate-torch": timing.Stage("the same with PyTorch's conv2d", "sample", correlate_torch, alone=True, needs=("torch",)),
+    "correlate-torch": timing.Stage("the same with PyTorch's conv2d", "sample", correlate_torch, **TORCH),
     "inputs": timing.Stage("examples of a training step", "sample", input_pipeline),
     "train": timing.Stage("training step", "sample", training_step),
     "train-many": timing.Stage(
@@ -374,7 +387,7 @@ STAGES = {
     "train-paper-network-bfloat16": timing.Stage(
         "that in bfloat16, batch 8", "sample", functools.partial(paper_network, batch=8, dtype=jnp.bfloat16), platform="gpu"
     ),
-    "train-paper-torch": timing.Stage("that with PyTorch", "sample", paper_torch, alone=True, needs=("torch",)),
+    "train-paper-torch": timing.Stage("that with PyTorch", "sample", paper_torch, **TORCH),
     "primitive": timing.Stage("one action of the arm", "action", primitive),
     "collect": timing.Stage("demonstrations", "demonstration", collection),
     "evaluate": timing.Stage(f"closed loop, {EPISODES} episodes and compiling", "episode", evaluation),

@@ -146,7 +146,10 @@ def stored_config(flags):
 
 def command(argv: Sequence[str] | None = None):
     """Run from the command line."""
-    return options.run(main, flags=FLAGS, config_from=stored_config, workdir=".", user_errors=common.USER_ERRORS, argv=argv)
+    owned = {f"eval.{name}": f"--{name}" for name in ("split", "start", "episodes")}
+    return options.run(
+        main, flags=FLAGS, config_from=stored_config, workdir=".", owned=lambda _: owned, user_errors=common.USER_ERRORS, argv=argv
+    )
 
 
 if __name__ == "__main__":

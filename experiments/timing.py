@@ -44,6 +44,7 @@ class Work:
     facts: Mapping[str, float] = dataclasses.field(default_factory=dict)  # of one run: flops, bytes, memory; and compile_seconds
     close: Callable[[], Any] = lambda: None  # gives back what it took
     cold: bool = False  # what its first run takes is asked for, compiling and all: there is no other
+    more: Callable[[], Any] = lambda: None  # goes on like a run that is `cold`: what compiles then was compiled before
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,6 +101,7 @@ def measured(work: Work, repeats: int) -> dict[str, Any]:
             runs, begin = [], time.perf_counter()
             while len(runs) < repeats and (not runs or time.perf_counter() - begin < SECONDS):
                 runs.append(clocked())
+        work.more()
     runs = [seconds / work.count for seconds in runs]
     again = len(compilations()) - before
     seconds = float(np.median(runs))
@@ -153,8 +155,9 @@ def alone(name: str, stage: Stage, config, repeats: int) -> dict[str, Any]:
     command = [sys.executable, "-m", "experiments.benchmark_stages"]
     try:
         done = subprocess.run(
-            command, input=request, capture_output=True, text=True, env={**stage.environment, **os.environ}, timeout=LIMIT, check=False
-        )
+            command, input=request, capture_output=True, text=True, timeout=LIMIT, check=False,
+            env={**stage.environment, **os.environ, "JAX_ENABLE_COMPILATION_CACHE": "false"},
+        )  # fmt: skip
     except subprocess.TimeoutExpired:
         raise Unavailable(f"not done after {LIMIT:.0f} s", failed=True) from None
     if done.returncode:

@@ -46,9 +46,9 @@ def build(jitted, *arguments: Any) -> tuple[Any, dict[str, float]]:
     """Compile a jitted function for its arguments, static ones among them, without running it.
 
     Gives the program, which takes those that are not static, and facts: `compile_seconds`, the `flops` of a run (see `flops`), as far as
-    XLA counts them the `bytes` that it moves, and the `memory` in bytes that it needs: arguments, results (those in donated memory once)
-    and what is between. On a CPU a program that needs more than LARGE is compiled once more, LEAN, and the memory that compiling has
-    left is given back.
+    XLA counts them the `bytes` that it moves (not where there is a loop, whose body it counts once), and the `memory` in bytes that it
+    needs: arguments, results (those in donated memory once) and what is between. On a CPU a program that needs more than LARGE is
+    compiled once more, LEAN, and the memory that compiling has left is given back.
     """
     begin = time.perf_counter()
     traced = jitted.trace(*arguments)
@@ -58,7 +58,7 @@ def build(jitted, *arguments: Any) -> tuple[Any, dict[str, float]]:
         program = lowered.compile(LEAN)
         _glibc("malloc_trim", 0)
     facts = {"compile_seconds": time.perf_counter() - begin}
-    moved = (program.cost_analysis() or {}).get("bytes accessed", 0)
+    moved = 0 if _loops(traced.jaxpr) else (program.cost_analysis() or {}).get("bytes accessed", 0)
     counts = {"flops": flops(traced.jaxpr), "bytes": moved, "memory": memory_of(program)}
     return program, facts | {name: float(count) for name, count in counts.items() if count > 0}
 
@@ -97,6 +97,13 @@ def flops(jaxpr) -> float:
     """
     whole = getattr(jaxpr, "jaxpr", jaxpr)
     return _counted(partial_eval.dce_jaxpr(whole, [True] * len(whole.outvars))[0])
+
+
+def _loops(jaxpr) -> bool:
+    """Say whether there is a loop in a jaxpr."""
+    equations = getattr(jaxpr, "jaxpr", jaxpr).eqns
+    within = [one for equation in equations for value in equation.params.values() for one in _jaxprs(value)]
+    return any(equation.primitive.name in ("scan", "while") for equation in equations) or any(map(_loops, within))
 
 
 def _counted(jaxpr) -> float:

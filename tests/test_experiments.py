@@ -561,6 +561,11 @@ def test_a_wrong_request_ends_with_one_message(tmp_path, capsys):
     for command, arguments, message in [
         (robustness.command, [], "give --checkpoint=PATH"),
         (robustness.command, [f"--checkpoint={tmp_path}"], "no checkpoint"),
+        (
+            robustness.command,
+            ["--checkpoint=pretrained/tower", "--config.eval.split=val"],
+            "--config.eval.split=val would have no effect: the field is set by --split",
+        ),
         (ablation.command, ["--task=castle"], "--task must be one of 'pallet', 'tower', got 'castle'"),
         (ablation.command, ["--config=configs/tower.py"], "--task=pallet, but the config is of 'tower': give --task=tower"),
         (table1.command, ["--config=configs/pallet.py"], "--task=tower, but the config is of 'pallet': give --task=pallet"),
