@@ -229,8 +229,8 @@ def _check_palette(config: Mapping[str, Any]) -> None:
 
 def check_data(config: Mapping[str, Any]) -> None:
     """Raise OptionsError where the group `data` asks for demonstrations that cannot be, before any is recorded."""
-    for name in ("demos", "threads"):
-        _positive(f"data.{name}", config["data"][name])
+    _positive("data.demos", config["data"]["demos"])
+    _not_negative("data.threads", config["data"]["threads"])
     mistakes(config)
     split_seeds("train", 0, config["data"]["demos"])
 
@@ -238,9 +238,9 @@ def check_data(config: Mapping[str, Any]) -> None:
 def check_evaluation(config: Mapping[str, Any]) -> None:
     """Raise OptionsError where the groups `eval` and `data` say of how many episodes what cannot be, before hours of training."""
     fields = config["eval"]
-    for name, value in (("eval.parallel", fields["parallel"]), ("data.threads", config["data"]["threads"])):
-        _positive(name, value)
-    _not_negative("eval.strips", fields["strips"])
+    _positive("eval.parallel", fields["parallel"])
+    for name, value in (("eval.strips", fields["strips"]), ("data.threads", config["data"]["threads"])):
+        _not_negative(name, value)
     options.check_choice("eval.split", fields["split"], SPLITS)
     split_seeds(fields["split"], fields["start"], fields["episodes"])
 

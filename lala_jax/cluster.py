@@ -10,6 +10,7 @@ from __future__ import annotations
 import collections
 import contextlib
 import dataclasses
+import errno
 import json
 import os
 import pathlib
@@ -168,6 +169,10 @@ def exclusive(path: pathlib.Path) -> Iterator[None]:
             except BlockingIOError:
                 print(f"waiting for the worker that holds {lock}", flush=True)
                 fcntl.flock(file, fcntl.LOCK_EX)
+            except OSError as error:
+                if error.errno not in (errno.ENOSYS, errno.ENOTSUP, errno.ENOLCK):
+                    raise
+                raise options.OptionsError(f"{lock.parent} is on a file system without locks (flock): choose another directory") from error
             if not _is_at(file, lock):
                 continue  # its holder removed it meanwhile, and another may hold a new one
             try:

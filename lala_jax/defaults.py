@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from typing import Any
 
@@ -34,7 +33,7 @@ def get(arg: str, *, task: str) -> ml_collections.ConfigDict:
     config.data.directory = f"data/{task}"  # demonstrations, recorded there in simulation until there are data.demos
     config.data.demos = 500
     config.data.mistakes = 0.0  # share of the demonstrations' actions that are spoiled, so that they show how to recover
-    config.data.threads = os.cpu_count() or 1  # of physics, in collection and evaluation
+    config.data.threads = 0  # of physics, in collection and evaluation; 0: as many as this process has cores
 
     config.camera = ml_collections.ConfigDict()
     config.camera.preset = "ring"  # a name in sim.scene.PRESETS

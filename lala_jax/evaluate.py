@@ -77,7 +77,9 @@ def stored_config(flags: Mapping[str, Any]):
     """Give the config that a checkpoint, or a card of published weights, holds."""
     if not flags["checkpoint"]:
         raise options.OptionsError(NO_CHECKPOINT)
-    return options.from_dict(pretrained.describe(flags["checkpoint"])["config"])
+    config = options.from_dict(pretrained.describe(flags["checkpoint"])["config"])
+    config.data.threads = 0  # it may be the number of cores of another machine
+    return config
 
 
 if __name__ == "__main__":

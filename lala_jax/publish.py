@@ -16,6 +16,7 @@ import os
 import pathlib
 import shlex
 import shutil
+import tempfile
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -209,10 +210,10 @@ def _row(found: Mapping[str, Any], more: Sequence[str], file: str) -> dict[str, 
 
 
 def _write(out: pathlib.Path, arrays: bytes, card: Mapping[str, Any]) -> None:
-    """Write the files beside `out` and rename them into place as one directory."""
-    temporary, old = (out.with_name(out.name + suffix) for suffix in (".tmp", ".old"))
-    for left in (temporary, old):
-        shutil.rmtree(left, ignore_errors=True)
+    """Write the files beside `out`, in a folder of a name of its own, and rename them into place as one directory."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    beside = pathlib.Path(tempfile.mkdtemp(dir=out.parent, prefix=f".{out.name}-"))
+    temporary, old = beside / "new", beside / "old"
     try:
         for name, content in ((pretrained.ARRAYS, arrays), (README, model_card(card).encode())):
             with writers.atomic(temporary / name) as file:
@@ -226,8 +227,7 @@ def _write(out: pathlib.Path, arrays: bytes, card: Mapping[str, Any]) -> None:
             os.replace(old, out)
         raise
     finally:
-        for left in (temporary, old):
-            shutil.rmtree(left, ignore_errors=True)
+        shutil.rmtree(beside, ignore_errors=True)
 
 
 def _pretrained(config: Mapping[str, Any]) -> str:

@@ -159,7 +159,7 @@ def refused(answer, *messages):
         ("data.demos=6000", [r"the train split has 5000 seeds, asked for 0\.\.5999"]),
         ("augment.missing=10.0", ["config field augment.missing must be at least 0 and at most 1, got 10.0"]),
         ("augment.turn=-1.0", ["config field augment.turn must be at least 0, got -1.0"]),
-        ("data.threads=0", ["config field data.threads must be above 0, got 0"]),
+        ("data.threads=-1", ["config field data.threads must be at least 0, got -1"]),
         ("eval.parallel=0", ["config field eval.parallel must be above 0, got 0"]),
         ("eval.split=tset", ["eval.split must be one of 'train', 'val', 'test', got 'tset'; did you mean test"]),
         ("eval.episodes=0", ["at least one seed, got start=0, count=0"]),
@@ -232,7 +232,7 @@ def test_what_cannot_be_written_is_told_before_the_work(trained, call, tmp_path)
 
 def test_collection_is_refused_what_cannot_be(call, tmp_path):
     refused(call("lala_jax.collect", *tiny(tmp_path / "data", "data.demos=0")), "config field data.demos must be above 0, got 0")
-    refused(call("lala_jax.collect", *tiny(tmp_path / "data", "data.threads=-1")), "config field data.threads must be above 0, got -1")
+    refused(call("lala_jax.collect", *tiny(tmp_path / "data", "data.threads=-1")), "config field data.threads must be at least 0, got -1")
     assert not (tmp_path / "data").exists()
 
 

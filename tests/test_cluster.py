@@ -1,5 +1,7 @@
 """Tasks in workers: each is done once whatever is killed, what is missing is named, and the results are those of one process."""
 
+import errno
+import fcntl
 import functools
 import json
 import os
@@ -198,6 +200,15 @@ def test_a_lock_excludes_and_goes_with_its_holder(tmp_path):
         threading.Timer(0.3, holder.kill).start()
         with cluster.exclusive(tmp_path / "x"):
             assert holder.wait() == -signal.SIGKILL
+
+
+def test_a_file_system_without_locks_is_named(tmp_path, monkeypatch):
+    def flock(file, how):
+        raise OSError(errno.ENOSYS, "Function not implemented")
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    with pytest.raises(options.OptionsError, match=f"{tmp_path} is on a file system without locks"), cluster.exclusive(tmp_path / "x"):
+        pytest.fail("there is no lock")
 
 
 def test_slurm(tmp_path, monkeypatch, capsys):

@@ -79,8 +79,11 @@ def test_publishing_again_gives_the_same_files(run, published):
     """Also from the published weights themselves, with scores of theirs."""
     before = contents(published)
     assert set(before) == {"weights.npz", "card.json", "README.md"}
+    backup = published.with_name("tiny.old")
+    backup.mkdir()  # of a user
     publish.publish(str(run[0]), [str(run[1])], published)
     assert contents(published) == before
+    backup.rmdir()
     assert "source" not in json.loads(before["card.json"])["data"]
     scored(options.from_dict(pretrained.describe(published)["config"]), published, published.parent / "eval")
     publish.publish(str(published), [str(published.parent / "eval" / "scores-policy-test.json")], published)
@@ -271,7 +274,7 @@ def test_a_failed_write_leaves_what_was_there(run, published, monkeypatch):
     real = publish.os.replace
 
     def fail(source, target):
-        if pathlib.Path(target) == published and pathlib.Path(source).suffix == ".tmp":
+        if pathlib.Path(target) == published and pathlib.Path(source).name == "new":
             raise OSError("the disk is full")
         real(source, target)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import concurrent.futures
 import dataclasses
+import os
 from collections.abc import Sequence
 
 import mujoco
@@ -248,13 +249,13 @@ class World:
 
 
 class Worlds:
-    """Worlds stepped side by side: MuJoCo lets go of Python's lock while it steps, so threads run on several cores."""
+    """Worlds stepped side by side: MuJoCo lets go of Python's lock while it steps, so `threads` run on several cores, 0 on all of them."""
 
     def __init__(self, worlds: Sequence[World], *, threads: int = 1):
-        if threads < 1:
-            raise ValueError(f"threads must be at least 1, got {threads}")
+        if threads < 0:
+            raise ValueError(f"threads must be at least 0, got {threads}")
         self.worlds = tuple(worlds)
-        self._threads = threads
+        self._threads = threads or _cores()
 
     def step(self, actions: Sequence[types.PickPlace | None]) -> list[Outcome | None]:
         """Give each world its action; None where an action is None. Outcomes do not depend on the number of threads."""
@@ -262,6 +263,11 @@ class Worlds:
             raise ValueError(f"one action a world is needed: {len(self.worlds)} worlds, got {len(actions)} actions")
         with concurrent.futures.ThreadPoolExecutor(self._threads) as pool:
             return list(pool.map(_step, self.worlds, actions))
+
+
+def _cores() -> int:
+    """Count the cores that this process may use, which a scheduler may have made fewer than the machine has."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _step(world: World, action: types.PickPlace | None) -> Outcome | None:

@@ -1,4 +1,5 @@
 import functools
+import os
 
 import mujoco
 import numpy as np
@@ -105,9 +106,16 @@ def test_outcomes_do_not_depend_on_the_number_of_threads():
     np.testing.assert_array_equal(results[0][1][2], scene().start)
 
 
+def test_worlds_take_the_cores_that_are_theirs(monkeypatch):
+    """Not those of the machine, nor those of the one where a config was written."""
+    monkeypatch.setattr(os, "cpu_count", lambda: 64)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {3, 5, 6}, raising=False)
+    assert [physics.Worlds([], threads=threads)._threads for threads in (0, 2)] == [3, 2]
+
+
 def test_worlds_refuses_what_cannot_be():
     with pytest.raises(ValueError, match="threads"):
-        physics.Worlds([], threads=0)
+        physics.Worlds([], threads=-1)
     with pytest.raises(ValueError, match="1 worlds, got 0 actions"):
         physics.Worlds([None]).step([])
 
