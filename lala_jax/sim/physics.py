@@ -28,6 +28,8 @@ REASONS = (
     "blocked",
     "unstable",
 )
+_DIVERGED = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
+_FAR = 1e3  # metres or radians, where nothing gets by itself
 APPROACH = 0.32  # metres above the pick and the place, where the arm can reach that far
 MIN_APPROACH = 0.08  # metres: a point that cannot be approached from here is out of reach
 _APPROACHES = tuple(np.arange(APPROACH, MIN_APPROACH - 1e-9, -0.02))
@@ -100,10 +102,11 @@ class World:
         reason, index, held = self._pick_and_place(pick, place, yaw)
         if self.data.time == 0.0:
             return Outcome(index, held, reason, 0.0)
-        self._retreat()
+        if not self._broken():
+            self._retreat()
         seconds = float(self.data.time)
         poses = self.poses()
-        if not np.isfinite(poses).all() or self.data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number:
+        if self._broken() or any(self.data.warning[kind].number for kind in _DIVERGED):
             reason, held, poses = "unstable", False, before
         self.reset(poses)
         return Outcome(index, held, reason, seconds)
@@ -179,6 +182,8 @@ class World:
         for q, v, a in zip(plan.position, plan.velocity, plan.acceleration, strict=True):
             self._arm.command(data, q, v, a)
             mujoco.mj_step(model, data, _TICK_STEPS)
+            if self._broken():
+                return "unstable"
             if sense and suction.touches(data, self._moving, self._own):
                 return "touched"
             if self._held >= 0 and suction.pull(data) > suction.HOLDING_FORCE:
@@ -226,8 +231,12 @@ class World:
         while self.data.time < end:
             mujoco.mj_step(self.model, self.data, _TICK_STEPS)
             speed = np.abs(self.data.qvel[self._free_speed])
-            if speed[:, :3].max() < _STILL[0] and speed[:, 3:].max() < _STILL[1]:
+            if self._broken() or speed[:, :3].max() < _STILL[0] and speed[:, 3:].max() < _STILL[1]:
                 return
+
+    def _broken(self) -> bool:
+        """Say whether the simulation has diverged so far that something is nowhere."""
+        return not (np.abs(self.data.qpos) < _FAR).all()
 
     def _tip_collides(self, on: bool) -> None:
         bits = self._tip_bits if on else (0, 0)

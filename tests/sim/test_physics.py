@@ -1,4 +1,5 @@
 import functools
+import itertools
 import os
 
 import mujoco
@@ -104,6 +105,40 @@ def test_outcomes_do_not_depend_on_the_number_of_threads():
     assert results[0][0][2] is None
     np.testing.assert_array_equal(results[0][1], results[1][1])
     np.testing.assert_array_equal(results[0][1][2], scene().start)
+
+
+def disturbed(monkeypatch, disturb):
+    """Do something to the data before each of MuJoCo's steps, told which one it is."""
+    real, number = mujoco.mj_step, itertools.count()
+
+    def step(model, data, count=1):
+        disturb(next(number), data)
+        real(model, data, count)
+
+    monkeypatch.setattr(mujoco, "mj_step", step)
+
+
+@pytest.mark.parametrize("speed", [np.nan, 1e11, 1e8, 1e5])
+@pytest.mark.parametrize("when", [20, 300, 520])
+def test_what_diverges_is_undone_and_said(world, monkeypatch, tmp_path, when, speed):
+    """On the way there, with a cube in hand, and after it: an outcome, not an exception, and the next action is as if nothing had been."""
+    monkeypatch.chdir(tmp_path)  # where MuJoCo writes its log
+    done = action(world.poses()[0], scene().goal[0])
+    with monkeypatch.context() as patch:
+        disturbed(patch, lambda number, data: number == when and data.qvel.__setitem__(slice(-18, None), speed))
+        outcome = world.step(done)
+    assert outcome.reason == "unstable" and not outcome.held_to_place and outcome.seconds >= 0
+    np.testing.assert_allclose(world.poses(), scene().start, atol=1e-12)
+    assert world.step(done).ok
+
+
+def test_what_does_not_come_to_rest_is_stopped(world, monkeypatch):
+    """A cube that turns and turns: two seconds more, then it is where it is."""
+    usual = physics.World(task(), scene()).step(action(scene().start[0], scene().goal[0]))
+    disturbed(monkeypatch, lambda number, data: data.qvel.__setitem__(world._free_speed[2, 5], 30.0))
+    outcome = world.step(action(scene().start[0], scene().goal[0]))
+    assert outcome.ok and usual.seconds + 1.0 < outcome.seconds < usual.seconds + physics._MAX_SETTLE + 0.1
+    assert not np.allclose(world.poses()[2], scene().start[2], atol=1e-2)
 
 
 def test_worlds_take_the_cores_that_are_theirs(monkeypatch):
