@@ -126,7 +126,8 @@ def draw(key: jax.Array, state: types.State, *, spec: types.MapSpec, rotations: 
     """Draw an object among `candidates` `[N]` bool, a cell of its visible top face, and say where it goes.
 
     Without `multi_action` the drawn pick and its place of least turn are the only right ones (the paper's one-hot labels); it is then
-    drawn as the demonstrations pick, about the middle of the face.
+    drawn as the demonstrations pick, about the middle of the face. The paper's are the recorded action's, here each visit draws anew:
+    over many visits of a state in which several objects may go next, they teach all of these.
     """
     key_object, key_cell = jax.random.split(key)
     state = jax.tree.map(jnp.asarray, state)  # outside jit it may be as a data set has it

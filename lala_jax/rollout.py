@@ -38,7 +38,7 @@ class Episode:
     @property
     def score(self) -> float:
         """Give the share of wanted objects that are placed at the end, 0..100."""
-        return 100.0 * float(self.placed[-1][oracle.wanted(self.scene)].mean())
+        return oracle.share(self.scene, self.placed[-1])
 
     @property
     def complete(self) -> bool:

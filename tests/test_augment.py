@@ -1,6 +1,7 @@
 """Augmentation keeps what it must: colours' identity, relative poses, the map; sensors err as often and as far as told."""
 
 import functools
+import types as python_types
 
 import jax
 import jax.numpy as jnp
@@ -76,18 +77,47 @@ def test_recolor_refuses_more_objects_than_colours():
 def test_rigid_moves_everything_by_one_motion(name):
     """The base, the objects and the goal move together: every relative pose stays, and all stay on the map."""
     state = state_of(name)
-    moved_some, motion = False, jax.jit(augment.rigid, static_argnames=("spec", "base_radius"))
-    for seed in range(12):
+    corners = np.array([[1, 1, 0], [1, -1, 0], [-1, 1, 0], [-1, -1, 0]]) * np.asarray(state.size)[:, None] / 2
+    motion = jax.jit(augment.rigid, static_argnames=("spec", "base_radius"))
+    for seed in range(40):
         new = motion(jax.random.key(seed), on_device(state), spec=SPEC, base_radius=0.04)
         for field in ("poses", "goal"):
             before = transforms.pose_multiply(transforms.pose_inverse(state.base.astype(float)), getattr(state, field).astype(float))
             after = transforms.pose_multiply(transforms.pose_inverse(np.asarray(new.base, float)), np.asarray(getattr(new, field), float))
             np.testing.assert_allclose(after[:, :3], before[:, :3], atol=1e-5)
             np.testing.assert_allclose(np.abs((after[:, 3:] * before[:, 3:]).sum(-1)), 1, atol=1e-5)
-            inside = types.in_map(SPEC, types.index_from_world(SPEC, jnp.asarray(getattr(new, field))[:, :2]))
-            assert np.asarray(inside).all()
-        moved_some |= not np.allclose(new.base, state.base, atol=1e-3)
-    assert moved_some
+            covered = transforms.apply_pose(np.asarray(getattr(new, field), float)[:, None], corners)[..., :2]
+            low, high = np.array([SPEC.x, SPEC.y]).T
+            assert (covered > low - 1e-5).all() and (covered < high + 1e-5).all()
+
+
+def test_rigid_motions_are_spread_as_they_say():
+    """Of a speck in the middle of the map nearly all fit: turns of N(0, 60 degrees), shifts of N(0, a sixth of the map)."""
+    state, middle = state_of("tower"), np.array([sum(SPEC.x) / 2, sum(SPEC.y) / 2, 0, 1, 0, 0, 0], np.float32)
+    all_there = np.stack([middle] * len(state.size))
+    speck = on_device(state.replace(size=np.full_like(state.size, 1e-3), poses=all_there, goal=all_there, base=middle))
+    keys = jax.random.split(jax.random.key(0), 2000)
+    base = np.asarray(jax.jit(jax.vmap(lambda key: augment.rigid(key, speck, spec=SPEC, base_radius=1e-3)))(keys).base, float)
+    yaw = 2 * np.arctan2(base[:, 6], base[:, 3])
+    assert 0.29 < (np.abs(transforms.wrap_angle(yaw)) > np.radians(60)).mean() < 0.35  # 0.317 of a normal distribution
+    sixth = np.array([SPEC.x[1] - SPEC.x[0], SPEC.y[1] - SPEC.y[0]]) / 6
+    np.testing.assert_allclose((base[:, :2] - middle[:2]).std(0) / sixth, 0.987, atol=0.04)  # cut off at three deviations
+    assert np.abs((base[:, :2] - middle[:2]).mean(0) / sixth).max() < 0.1
+
+
+@pytest.mark.parametrize("recolor", [False, True])
+@pytest.mark.parametrize("rigid", [False, True])
+def test_examples_are_disturbed_as_the_recipe_says(recolor, rigid):
+    state, observer = on_device(state_of("tower")), python_types.SimpleNamespace(task=tasks.get("tower"), spec=SPEC)
+    keys = jax.random.split(jax.random.key(0), 20)
+    disturb = functools.partial(train_step.augmented, observer=observer, recolor=recolor, mix=0.5, rigid=rigid)
+    new = jax.jit(jax.vmap(disturb, (0, None)))(keys, state)
+    assert (np.abs(new.color - state.color).max((1, 2)) > 0.01).mean() == (1 if recolor else 0)
+    for field in ("poses", "goal", "base"):
+        moved = np.abs(getattr(new, field) - getattr(state, field)).reshape(20, -1).max(1) > 1e-3
+        assert moved.any() == rigid
+    for field in ("size", "symmetry", "placed", "ready"):
+        assert (np.asarray(getattr(new, field)) == np.asarray(getattr(state, field))).all()
 
 
 def test_rigid_motion_carries_the_labels():

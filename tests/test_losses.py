@@ -39,10 +39,13 @@ def top_owner(state, xy):
 
 
 @pytest.mark.parametrize("name", ["tower", "pallet"])
-def test_pick_valid_equals_loop(name):
+@pytest.mark.parametrize("built", [False, True])
+def test_pick_valid_equals_loop(name, built):
+    """Beside each other, and one upon the other: what lies below is no pick."""
     state = state_of(name)
+    state = state.replace(poses=state.goal) if built else state
     valid = np.asarray(losses.pick_valid(on_device(state), spec=SPEC))
-    assert valid.any((1, 2)).all()
+    assert valid.any((1, 2)).all() == (not built)
     centres = np.asarray(losses.cell_centres(SPEC))
     for row in range(0, SPEC.rows):
         for col in range(row % 3, SPEC.cols, 3):  # every third cell, all columns in turn
@@ -174,15 +177,25 @@ def test_place_cross_entropy_equals_masked():
     np.testing.assert_allclose(loss, losses.masked_cross_entropy(jnp.asarray(logits), jnp.asarray(mask)), rtol=1e-5)
 
 
-def test_owner_finds_the_box_a_point_is_in():
+@pytest.mark.parametrize("where", ["goal", "start"])
+def test_owner_finds_the_box_a_point_is_in(where):
+    """In boxes that stand close to each other, and in boxes turned anyhow; just outside a face there is none."""
     scene = tasks.get("pallet").sample(2)
+    poses = getattr(scene, where)
     rng = np.random.default_rng(0)
     local = rng.uniform(-0.45, 0.45, (8, 20, 3)) * scene.size[:, None]
-    points = transforms.apply_pose(scene.goal[:, None].astype(float), local)
-    whose = losses.owner(jnp.asarray(points.reshape(-1, 3), jnp.float32), poses=scene.goal, size=scene.size, tolerance=0.005)
-    assert (np.asarray(whose).reshape(8, 20) == np.arange(8)[:, None]).all()
-    far = jnp.array([[0.3, -0.4, 0.2]])
-    assert int(losses.owner(far, poses=scene.goal, size=scene.size, tolerance=0.005)[0]) == -1
+
+    def whose(local, tolerance):
+        points = transforms.apply_pose(poses[:, None].astype(float), local).reshape(-1, 3)
+        found = losses.owner(jnp.asarray(points, jnp.float32), poses=poses, size=scene.size, tolerance=tolerance)
+        return np.asarray(found).reshape(8, -1)
+
+    assert (whose(local, 0.005) == np.arange(8)[:, None]).all()
+    if where == "start":  # each by itself
+        beside = np.array([[1, 0.9, 0], [-1, -0.9, 0], [0.9, 1, 0], [-0.9, -1, 0]]) * scene.size[:, None] / 2
+        outwards = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
+        assert (whose(beside + 0.004 * outwards, 0.005) == np.arange(8)[:, None]).all()
+        assert (whose(beside + 0.006 * outwards, 0.005) == -1).all()
 
 
 def test_huber_is_quadratic_then_linear():

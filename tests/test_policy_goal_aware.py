@@ -242,6 +242,32 @@ def test_a_state_as_a_data_set_has_it_will_do(agent):
         assert action.pick.shape == (3,)
 
 
+@pytest.mark.parametrize("yaw", [0.0, 0.6])
+def test_tokens_are_told_whose_they_are_where_they_lie(yaw):
+    """The slopes of the loss at equal scores point at the tokens whose middles are in the goal of what may go next, turned or not."""
+    state, pool = state_of(0), goal_aware.POOL
+    goal = transforms.pose_from_yaw(np.array([[0.52, 0.11, 0.05], [0.41, -0.23, 0.03]]), np.array([yaw, -yaw])).astype(np.float32)
+    size = np.array([[0.09, 0.05, 0.04], [0.05, 0.05, 0.05]], np.float32)
+    state = state.replace(goal=jnp.asarray(goal), size=jnp.asarray(size), placed=jnp.zeros(2, bool), ready=jnp.array([True, False]))
+    grid = np.stack(np.meshgrid(*map(np.arange, (SPEC.rows // pool, SPEC.cols // pool, SPEC.slices)), indexing="ij"), -1).reshape(-1, 3)
+    match = goal_aware.Match(
+        pick=jnp.zeros((SPEC.rows, SPEC.cols)), current=jnp.zeros((SPEC.rows // pool, SPEC.cols // pool, 2)), token=jnp.asarray(grid),
+        token_valid=jnp.ones(len(grid), bool), token_embedding=jnp.zeros((len(grid), 2)), token_next=jnp.zeros(len(grid)),
+    )  # fmt: skip
+
+    def loss(scores):
+        return POLICIES["goal_aware"]._match_losses(jax.random.key(0), state, match.replace(token_next=scores))[1]
+
+    told = np.asarray(jax.grad(loss)(match.token_next)) < 0
+    x = SPEC.x[0] + (grid[:, 1] + 0.5) * pool * SPEC.cell - goal[0, 0]
+    y = SPEC.y[0] + (grid[:, 0] + 0.5) * pool * SPEC.cell - goal[0, 1]
+    z = SPEC.z[0] + (grid[:, 2] + 0.5) * (SPEC.z[1] - SPEC.z[0]) / SPEC.slices - goal[0, 2]
+    along, across = x * np.cos(yaw) + y * np.sin(yaw), y * np.cos(yaw) - x * np.sin(yaw)
+    beyond = np.max(np.abs([along, across, z]) - size[0][:, None] / 2, axis=0) - policy_goal_aware.TOKEN_TOLERANCE
+    clear = np.abs(beyond) > 1e-5
+    assert (told == (beyond < 0))[clear].all() and told.sum() > 4
+
+
 def means(metrics):
     """The mean of every metric over some steps."""
     return {name: float(np.mean([one[name] for one in metrics])) for name in metrics[0]}

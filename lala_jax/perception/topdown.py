@@ -84,7 +84,7 @@ def from_views(
     `views.rgb` is `[V, H, W, 3]` in 0..1 and `views.depth` `[V, H, W]` in metres along the camera's z, 0 where nothing was measured; the
     cameras' poses are in the frame of the map: the robot's base, x forward, z up, the table at z = 0. The margins are those of `fuse`.
     Raises ValueError for whole numbers and for shapes that do not fit. Of wrong units, inverted poses or OpenGL's camera axes it knows
-    nothing: the map is then empty (`count` is 0).
+    nothing: the map is then empty (`count` is 0), or wrong.
     """
     cameras.check_floating("views.rgb", views.rgb, "in 0..1")
     cameras.check_floating("views.depth", views.depth, "metres")

@@ -47,7 +47,12 @@ def placed(task: base.Task, scene: types.Scene, poses: np.ndarray) -> np.ndarray
 
 def score(task: base.Task, scene: types.Scene, poses: np.ndarray) -> float:
     """Give the share of wanted objects that are placed, 0..100."""
-    return 100.0 * float(placed(task, scene, poses)[wanted(scene)].mean())
+    return share(scene, placed(task, scene, poses))
+
+
+def share(scene: types.Scene, there: np.ndarray) -> float:
+    """Give the share of wanted objects, 0..100, of which `there` `[N]` says that they are placed."""
+    return 100.0 * float(there[wanted(scene)].mean())
 
 
 def done(task: base.Task, scene: types.Scene, poses: np.ndarray) -> bool:
@@ -139,40 +144,6 @@ def _yaws(now: float, target: float, symmetry: float) -> np.ndarray:
 def _carry(pick: np.ndarray, pose: np.ndarray, target: np.ndarray, yaw: np.ndarray | float) -> np.ndarray:
     """Give where the picked points `[..., 3]` go when a turn by `yaw` `[...]` and a shift bring the object from `pose` to `target`."""
     return target[:3] + transforms.rotate(transforms.quat_from_yaw(np.asarray(yaw, float)), pick - pose[:3])
-
-
-def _pick_cells(scene: types.Scene, poses: np.ndarray, index: int, spec: types.MapSpec) -> np.ndarray:
-    """Give the world points `[P, 3]` over the cell centres on the visible top face of upright object `index`, `EDGE` inside it."""
-    poses, size = _boxes(scene, poses)
-    half = geometry.extent(poses[index], size[index])
-    low = np.floor((poses[index, :2] - half[:2] - [spec.x[0], spec.y[0]]) / spec.cell).astype(int)
-    count = np.ceil(2 * half[:2] / spec.cell).astype(int) + 1
-    col, row = (grid.ravel() for grid in np.meshgrid(low[0] + np.arange(count[0]), low[1] + np.arange(count[1])))
-    inside = (col >= 0) & (row >= 0) & (col < spec.cols) & (row < spec.rows)
-    xy = np.stack([spec.x[0] + (col + 0.5) * spec.cell, spec.y[0] + (row + 0.5) * spec.cell], axis=-1)[inside]
-    keep = geometry.covers(poses[index], size[index], xy, EDGE)
-    top = _top_centers(scene, poses)
-    for other in np.flatnonzero(top[:, 2] > top[index, 2]):
-        keep &= ~geometry.covers(poses[other], size[other], xy, -_TOUCH)
-    return np.column_stack([xy[keep], np.full(keep.sum(), top[index, 2])])
-
-
-def actions(
-    task: base.Task, scene: types.Scene, poses: np.ndarray, spec: types.MapSpec = base.WORKSPACE
-) -> tuple[types.PickPlace, np.ndarray]:
-    """Give all right actions, leaves `[A, ...]`, and the object each moves, int `[A]`: every ready object, pick cell and symmetric yaw."""
-    poses, _ = _boxes(scene, poses)
-    goal, symmetry = np.asarray(scene.goal, float), np.asarray(scene.symmetry, float)
-    picks, places, turns, objects = [np.zeros((0, 3))], [np.zeros((0, 3))], [np.zeros(0)], [np.zeros(0, int)]
-    for i in np.flatnonzero(ready(task, scene, poses)):
-        cells = _pick_cells(scene, poses, i, spec)
-        for yaw in _yaws(geometry.yaw(poses[i]), geometry.yaw(goal[i]), symmetry[i]):
-            picks.append(cells)
-            places.append(_carry(cells, poses[i], goal[i], np.full(len(cells), yaw)))
-            turns.append(np.full(len(cells), yaw))
-            objects.append(np.full(len(cells), i))
-    pick, place, yaw = (np.concatenate(parts).astype(np.float32) for parts in (picks, places, turns))
-    return types.PickPlace(pick=pick, place=place, yaw=yaw), np.concatenate(objects)
 
 
 def move(scene: types.Scene, poses: np.ndarray, index: int, target: np.ndarray, rng: np.random.Generator) -> types.PickPlace:

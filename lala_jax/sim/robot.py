@@ -234,13 +234,6 @@ def reachable(xyz: np.ndarray, yaw: float | None = None) -> bool | np.ndarray:
     return bool(inside) if inside.ndim == 0 else inside
 
 
-def max_height(xy: np.ndarray) -> float | np.ndarray:
-    """Give the greatest reachable z in metres of the tip above `xy` `[..., 2]`; NaN where no height is reachable."""
-    square = _LONGEST**2 - _outwards(xy) ** 2
-    height = np.sqrt(np.where(square >= 0, square, np.nan)) - _WRIST_HEIGHT
-    return float(height) if height.ndim == 0 else height
-
-
 class Arm:
     """Where the arm's joints live in a compiled model, and how to command them."""
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from sim.test_tasks import DISTRACTED
 
-from lala_jax import types
 from lala_jax.perception import transforms
 from lala_jax.sim import oracle, physics, tasks
 
@@ -112,35 +111,8 @@ def test_only_what_is_supported_is_ready_at_the_start(task):
     assert not oracle.ready(task, scene, goal(scene)).any()
 
 
-@pytest.mark.parametrize("cell", [0.003125, 0.00625])
-def test_actions_are_all_right_and_all_there(task, cell):
-    spec = types.MapSpec(cell=cell)
-    scene = task.sample(6)
-    poses = start(scene)
-    actions, objects = oracle.actions(task, scene, poses, spec)
-    # Slowly: every cell of the map against every face.
-    y, x = np.meshgrid(spec.y[0] + (np.arange(spec.rows) + 0.5) * cell, spec.x[0] + (np.arange(spec.cols) + 0.5) * cell, indexing="ij")
-    cells = [tuple(cell) for cell in np.asarray(types.index_from_world(spec, actions.pick[:, :2])).tolist()]
-    for i, is_ready in enumerate(oracle.ready(task, scene, poses)):
-        yaw = transforms.yaw_from_quat(poses[i, 3:])
-        dx, dy = x - poses[i, 0], y - poses[i, 1]
-        inside = np.abs(dx * np.cos(yaw) + dy * np.sin(yaw)) <= scene.size[i, 0] / 2 - 0.01
-        inside &= np.abs(dy * np.cos(yaw) - dx * np.sin(yaw)) <= scene.size[i, 1] / 2 - 0.01
-        expected = sorted(tuple(cell) for cell in np.argwhere(inside).tolist()) if is_ready else []
-        assert sorted(cells[k] for k in np.flatnonzero(objects == i)) == sorted(expected * int(task.symmetries(scene)[i]))
-    np.testing.assert_allclose(actions.pick[:, :2], types.world_from_index(spec, np.array(cells)), atol=1e-6)
-    for k in np.random.default_rng(0).permutation(len(objects))[:40]:
-        action = types.PickPlace(pick=actions.pick[k], place=actions.place[k], yaw=actions.yaw[k])
-        after = carried(poses, objects[k], action)
-        assert oracle.placed(task, scene, after)[objects[k]]
-        np.testing.assert_allclose(after[objects[k], :3], scene.goal[objects[k], :3], atol=1e-5)
-    assert (np.abs(actions.yaw) <= np.pi + 1e-6).all() and actions.pick.dtype == np.float32
-
-
-def test_no_actions_when_complete(task):
+def test_no_action_when_complete(task):
     scene = task.sample(0)
-    actions, objects = oracle.actions(task, scene, goal(scene))
-    assert actions.pick.shape == (0, 3) and actions.yaw.shape == objects.shape == (0,)
     assert oracle.act(task, scene, goal(scene), np.random.default_rng(0)) is None
 
 

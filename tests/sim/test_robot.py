@@ -102,15 +102,6 @@ def test_reachable_is_what_the_inverse_kinematics_solve(z):
         assert robot.reachable(xyz) == (stretch <= robot.MAX_STRETCH * abs(upper + fore))
 
 
-def test_max_height_is_the_last_reachable_one():
-    xyz = _workspace(0.0)
-    top = robot.max_height(xyz[:, :2])
-    assert robot.reachable(np.column_stack([xyz[:, :2], top - 1e-6])).all()
-    assert not robot.reachable(np.column_stack([xyz[:, :2], top + 1e-6])).any()
-    assert math.isnan(robot.max_height((2.0, 0.0)))
-    assert math.isnan(robot.max_height((0.0, 0.0)))
-
-
 def test_unreachable_arguments():
     assert robot.reachable((0.5, 0.0, 0.1)) is True
     assert robot.reachable((1.5, 0.0, 0.1)) is False

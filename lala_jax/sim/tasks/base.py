@@ -257,10 +257,6 @@ class Task:
         touching = np.abs((goal[:, 2] - half)[:, None] - (goal[:, 2] + half)[None, :]) < 1e-3
         return touching & (geometry.gap(goal[:, None], size[:, None], goal, size) < -1e-4)
 
-    def symmetries(self, scene: types.Scene) -> np.ndarray:
-        """Give how many yaws look the same `[N]`: 4 for a square box, 2 for another."""
-        return np.round(2 * np.pi / np.asarray(scene.symmetry)).astype(int)
-
 
 def color_name(rgb: np.ndarray) -> str:
     """Name the palette colour nearest to `rgb` `[3]` in 0..1."""
