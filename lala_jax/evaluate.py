@@ -77,9 +77,8 @@ def stored_config(flags: Mapping[str, Any]):
     """Give the config that a checkpoint, or a card of published weights, holds."""
     if not flags["checkpoint"]:
         raise options.OptionsError(NO_CHECKPOINT)
-    config = options.from_dict(pretrained.describe(flags["checkpoint"])["config"])
-    config.data.threads = 0  # it may be the number of cores of another machine
-    return config
+    stored = options.from_dict(pretrained.describe(flags["checkpoint"])["config"])
+    return options.override(stored, ["data.threads=0"])  # it may be the number of cores of another machine
 
 
 if __name__ == "__main__":

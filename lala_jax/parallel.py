@@ -53,6 +53,7 @@ def launched(environ: Mapping[str, str]) -> dict[str, Any] | None:
         if not 0 <= process < count:
             raise options.OptionsError(f"JAX_PROCESS_ID must be from 0 to JAX_NUM_PROCESSES - 1 = {count - 1}, got {process}")
         return {"coordinator_address": address, "num_processes": count, "process_id": process} if count > 1 else None
+    told: dict[str, Any]
     if "SLURM_STEP_NODELIST" in environ:  # inside srun; a batch script by itself is one process, whatever the job's tasks
         told = {"num_processes": _number(environ, "SLURM_STEP_NUM_TASKS" if "SLURM_STEP_NUM_TASKS" in environ else "SLURM_NTASKS")}
         beside = environ.get("SLURM_STEP_TASKS_PER_NODE", "")  # 4 or 4(x2), where they are as many on every node

@@ -15,6 +15,7 @@ from jax.flatten_util import ravel_pytree
 
 from lala_jax.sim import render_shapes, scene
 
+CHUNK = 64  # tiles that are cast at once
 SAME = 2e-5  # relative: depths of one surface in the two passes differ by rounding only
 
 
@@ -78,7 +79,8 @@ def _paint(name, wins, cosine, rgb, index, old):
 def _draw_tiles(kinds, tile, image, lens, jobs):
     """Cast every geom on the tiles it projects to: first the depths, then the paint wherever a geom's depth is the final one.
 
-    Two passes because XLA updates a buffer in place only while no other update in the loop's body reads it.
+    Two passes because XLA updates a buffer in place only while no other update in the loop's body reads it. Tiles are cast CHUNK at a time,
+    which vectorises and takes all cores, and put one by one.
     """
     image = dict(image)
     tile = tuple(min(side, limit) for side, limit in zip(tile, image["depth"].shape[1:], strict=True))
@@ -101,18 +103,23 @@ def _table(kind, tile, lens, group):
     top, left, bottom, right = jnp.moveaxis(group["box"].reshape(-1, 4), -1, 0)
     across, down = (right - left + tile[1] - 1) // tile[1], (bottom - top + tile[0] - 1) // tile[0]
     images = jnp.repeat(jnp.arange(count), geoms)
-    integers = [images, group["id"].reshape(-1), top, left, jnp.maximum(across, 1), jnp.maximum(across, 0) * jnp.maximum(down, 0)]
+    last = jnp.cumsum(jnp.maximum(across, 0) * jnp.maximum(down, 0))  # number of the tile after a job's last
+    integers = [images, group["id"].reshape(-1), top, left, jnp.maximum(across, 1), last]
     return kind, restore, numbers, jnp.stack([leaf.astype(jnp.int32) for leaf in integers], axis=1)
 
 
-def _nearer(_, start, new, cosine, old):
-    del start, cosine
+def _nearer(start, cast, old):
+    del start
+    new = cast["depth"]
     return {"depth": jnp.where((new < old["depth"]) | ((old["depth"] == 0) & jnp.isfinite(new)), new, old["depth"])}
 
 
-def _paint_visible(final, job, start, new, cosine, old):
-    wins = new <= jax.lax.dynamic_slice(final, start, (1, *new.shape))[0] * (1 + SAME)
-    return {name: _paint(name, wins, cosine, job["rgb"], job["id"], leaf) for name, leaf in old.items()}
+def _paint_visible(final, start, cast, old):
+    wins = cast["depth"] <= jax.lax.dynamic_slice(final, start, (1, *cast["depth"].shape))[0] * (1 + SAME)
+    paint = {"segmentation": cast["id"]}
+    if "rgb" in old:
+        paint["rgb"] = cast["shade"][..., None] * cast["rgb"]
+    return {name: jnp.where(wins[..., None] if name == "rgb" else wins, paint[name], leaf) for name, leaf in old.items()}
 
 
 def _over_tiles(table, tile, buffers, update):
@@ -121,20 +128,31 @@ def _over_tiles(table, tile, buffers, update):
     if not buffers:
         return buffers
     height, width = next(iter(buffers.values())).shape[1:3]
+    last = integers[:, 5]
 
-    def draw_geom(number, buffers):
-        row, (image, index, top, left, across, tiles) = numbers[number], integers[number]
+    def cast_tile(number):
+        """Cast the tile of this number among all jobs' tiles; it hits nothing where there are not so many."""
+        job = jnp.minimum((last <= number).sum(), len(last) - 1)
+        (geom, rgb, lens), (image, index, top, left, across, end) = restore(numbers[job]), integers[job]
+        at = number - jnp.where(job > 0, last[job - 1], 0)
+        down = jnp.minimum(top + at // across * tile[0], height - tile[0])
+        right = jnp.minimum(left + at % across * tile[1], width - tile[1])
+        depth, cosine = render_shapes.cast(kind, geom, *_rays(lens, down, right, tile))
+        start = jnp.where(number < end, jnp.stack([image, down, right]), 0)
+        shade = scene.AMBIENT + scene.DIFFUSE * cosine
+        return {"depth": jnp.where(number < end, depth, jnp.inf), "shade": shade, "rgb": rgb, "id": index, "start": start}
 
-        def draw_tile(at, buffers):
-            geom, rgb, lens = restore(row)
-            down = jnp.minimum(top + at // across * tile[0], height - tile[0])
-            right = jnp.minimum(left + at % across * tile[1], width - tile[1])
-            depth, cosine = render_shapes.cast(kind, geom, *_rays(lens, down, right, tile))
-            starts = {name: (image, down, right) + (0,) * (leaf.ndim - 3) for name, leaf in buffers.items()}
+    def draw_chunk(chunk, buffers):
+        cast = jax.vmap(cast_tile)(chunk * CHUNK + jnp.arange(CHUNK))
+
+        def put(number, buffers):
+            one = {name: leaf[number] for name, leaf in cast.items()}
+            start = tuple(one["start"])
+            starts = {name: start + (0,) * (leaf.ndim - 3) for name, leaf in buffers.items()}
             old = {name: jax.lax.dynamic_slice(leaf, starts[name], (1, *tile, *leaf.shape[3:]))[0] for name, leaf in buffers.items()}
-            new = update({"rgb": rgb, "id": index}, (image, down, right), depth, cosine, old)
+            new = update(start, one, old)
             return {name: jax.lax.dynamic_update_slice(leaf, new[name][None], starts[name]) for name, leaf in buffers.items()}
 
-        return jax.lax.fori_loop(0, tiles, draw_tile, buffers)
+        return jax.lax.fori_loop(0, jnp.minimum(CHUNK, last[-1] - chunk * CHUNK), put, buffers)
 
-    return jax.lax.fori_loop(0, numbers.shape[0], draw_geom, buffers)
+    return jax.lax.fori_loop(0, (last[-1] + CHUNK - 1) // CHUNK, draw_chunk, buffers)
