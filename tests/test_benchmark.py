@@ -153,6 +153,7 @@ def test_mujoco_renders_the_arm_where_we_do(monkeypatch):
     class Renderer:
         def __init__(self, model, height, width):
             self.model, self.depth, self.size = model, None, (height, width)
+            assert model.vis.quality.offsamples == 3
 
         def enable_depth_rendering(self):
             self.depth = True
@@ -173,7 +174,7 @@ def test_mujoco_renders_the_arm_where_we_do(monkeypatch):
     for task in ("tower", "pallet"):
         seen.clear()
         config = options.load(f"configs/{task}.py")
-        benchmark_stages.render_mujoco(benchmark_stages.full_size(config)).run()
+        benchmark_stages.render_mujoco(benchmark_stages.full_size(config), samples=3).run()
         assert [(camera, depth) for camera, depth, *_ in seen] == [(f"camera{i}", depth) for i in range(4) for depth in (False, True)]
         for _, _, size, joints, _ in seen:
             assert size == (480, 640)
