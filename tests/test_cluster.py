@@ -322,6 +322,11 @@ def inline(monkeypatch):
 def test_what_rows_share_comes_before_them(monkeypatch, tmp_path):
     ran, collected, trained = inline(monkeypatch), [], []
 
+    def pretrained_backbone(config, path):
+        with writers.Writer(path, tensorboard=False) as writer:
+            writer.scalars(1, {"seconds_per_step": 2.0})
+        return f"{path}/backbone.npz"
+
     def fake(config, path):
         trained.append(config)
         with writers.Writer(path, tensorboard=False) as writer:
@@ -329,7 +334,7 @@ def test_what_rows_share_comes_before_them(monkeypatch, tmp_path):
         return summary(build.split_seeds(config.eval.split, config.eval.start, config.eval.episodes))
 
     monkeypatch.setattr(recording, "collect", lambda config, **_: collected.append(config.data))
-    monkeypatch.setattr(pretrain, "pretrain", lambda config, path: f"{path}/backbone.npz")
+    monkeypatch.setattr(pretrain, "pretrain", pretrained_backbone)
     monkeypatch.setattr(common, "check_run", lambda *_: None)
     monkeypatch.setattr(common, "load_weights", lambda *_: (None, {"step": 1}))
     monkeypatch.setattr(common, "score", lambda config, params, seeds: summary(seeds))
