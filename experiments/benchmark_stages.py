@@ -338,6 +338,7 @@ def first_step(config, *, cached: bool) -> timing.Work:
     return timing.Work(run, close=folder.cleanup)
 
 
+OPENGL: dict[str, Any] = {"alone": True, "environment": EGL}
 TORCH: dict[str, Any] = {"alone": True, "needs": ("torch",), "platform": "cpu"}
 CEILINGS = {"matmul": "flops", "copy": "bytes"}
 LARGE = {"model.dtype": "bfloat16", "train.batch_size": 8}  # how a GPU takes the paper's step
@@ -354,19 +355,18 @@ STAGES = {
     "first-step": timing.Stage("from starting Python to the first training step", "start", functools.partial(first_step, cached=False)),
     "first-step-cached": timing.Stage("the same with programs kept from before", "start", functools.partial(first_step, cached=True)),
     "render": timing.Stage("render 4 views of 640 x 480", "observation", lambda config: render_views(full_size(config))),
-    **{
-        name: timing.Stage(
-            f"the same with mujoco.Renderer, {told}",
-            "observation",
-            lambda config, samples=samples: render_mujoco(full_size(config), samples=samples),
-            alone=True,
-            environment=EGL,
-        )
-        for name, samples, told in (
-            ("render-mujoco", 0, "one sample a pixel, as ours"),
-            ("render-mujoco-smooth", 4, "four samples, as it does unless told"),
-        )
-    },
+    "render-mujoco": timing.Stage(
+        "the same with mujoco.Renderer, one sample a pixel, as ours",
+        "observation",
+        lambda config: render_mujoco(full_size(config), samples=0),
+        **OPENGL,
+    ),
+    "render-mujoco-smooth": timing.Stage(
+        "the same with mujoco.Renderer, four samples, as it does unless told",
+        "observation",
+        lambda config: render_mujoco(full_size(config), samples=4),
+        **OPENGL,
+    ),
     "fuse": timing.Stage("unproject and fuse them", "observation", lambda config: fuse(full_size(config))),
     "observe": timing.Stage("render, unproject and fuse", "observation", lambda config: observe(full_size(config))),
     "observe-many": timing.Stage("the same, batch 64", "observation", lambda config: observe(full_size(config), count=64), platform="gpu"),

@@ -251,9 +251,7 @@ def model_card(card: Mapping[str, Any]) -> str:
         demonstrations = f"{data['demonstrations']} demonstrations of the scripted oracle in simulation; no other data, {frozen}.{spoiled}"
         demonstrations += f" Their seeds: {data['seeds']}."
         seen = "Simulation only: never run on a robot or on pictures of real cameras."
-        lacks = (
-            " For a misplaced object, the demonstrations " + ("show few ways" if data["mistakes"] else "never show how") + " to recover."
-        )
+        lacks = f" For a misplaced object, the demonstrations {'show few ways' if data['mistakes'] else 'never show how'} to recover."
     else:
         demonstrations = f"{data['demonstrations']} demonstrations: {data['source']}; {frozen}."
         seen, lacks = "The scores are of simulation only.", ""

@@ -140,10 +140,9 @@ def demonstrate(task: base.Task, seeds: list[int], *, threads: int, mistakes: fl
 
 def _attempt(task: base.Task, seeds: list[int], *, threads: int, mistakes: float) -> list[rollout.Episode]:
     """Give the oracle's episodes in the scenes of `seeds` that have room for all objects."""
-    pairs = list(task.roomy(seeds))
-    if not pairs:
+    usable, scenes = task.roomy_lists(seeds)
+    if not usable:
         return []
-    usable, scenes = map(list, zip(*pairs, strict=True))
     agent = rollout.erring_agent(task, scenes, usable, share=mistakes)
     budget = math.ceil(task.budget * (1.0 + PATIENCE * mistakes))
     return rollout.run(task, scenes, usable, agent, threads=threads, max_actions=budget)

@@ -103,7 +103,7 @@ def evaluate(
     task, parallel, episodes, drawn, failed = observer.task, min(parallel, len(seeds)), [], {}, 0
     places = range(len(seeds)) if places is None else places
     for start in range(places.start, places.stop, parallel):
-        chunk, scenes = _with_room(task, seeds[start : start + parallel])
+        chunk, scenes = task.roomy_lists(seeds[start : start + parallel])
         if not chunk:
             continue
         actor = PolicyAgent(agent, params, observer, scenes, parallel=parallel, key=jax.random.fold_in(jax.random.key(seed), start))
@@ -119,12 +119,6 @@ def evaluate(
         if progress is not None:
             progress(min(start + parallel, places.stop) - places.start, len(places))
     return rollout.summary(_some(episodes, seeds)), drawn
-
-
-def _with_room(task, seeds: Sequence[int]) -> tuple[list[int], list[types.Scene]]:
-    """Give the seeds whose scenes have room for all objects, and these scenes."""
-    pairs = list(task.roomy(seeds))
-    return [seed for seed, _ in pairs], [scene for _, scene in pairs]
 
 
 def _some(episodes: list[rollout.Episode], seeds: Sequence[int]) -> list[rollout.Episode]:
@@ -146,7 +140,7 @@ def baseline(name: str, observer_task, *, seeds: Sequence[int], threads: int) ->
     Scenes are passed over as in `evaluate`.
     """
     options.check_choice("agent", name, oracle.AGENTS)
-    usable, scenes = _with_room(observer_task, seeds)
+    usable, scenes = observer_task.roomy_lists(seeds)
     agent = rollout.oracle_agent(observer_task, scenes, usable, name)
     return rollout.summary(_some(rollout.run(observer_task, scenes, usable, agent, threads=threads), seeds))
 

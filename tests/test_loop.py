@@ -83,21 +83,27 @@ def test_a_step_is_prepared_once_and_only_where_one_is_taken(tmp_path):
     assert prepared == [0, 2]
 
 
-def test_every_second_of_a_step_is_in_the_curve_however_often_it_was_stopped(tmp_path, monkeypatch):
-    """Compiling takes ten minutes; the steps before a stop, and the few after it, are neither lost nor counted twice."""
+def clocked(monkeypatch, *, compiling, between):
+    """Let nothing take time but compiling and what comes between two steps: `prepared` and `after` for `go`."""
     now = [0.0]
     monkeypatch.setattr(loop, "time", types.SimpleNamespace(time=lambda: now[0]))
 
     class Slow(list):
         def append(self, number):
-            now[0] += 600.0
+            now[0] += compiling
 
     def wait(number, run):
-        now[0] += 1.0
+        now[0] += between
         return False
 
+    return Slow(), wait
+
+
+def test_every_second_of_a_step_is_in_the_curve_however_often_it_was_stopped(tmp_path, monkeypatch):
+    """Compiling takes ten minutes; the steps before a stop, and the few after it, are neither lost nor counted twice."""
+    slow, wait = clocked(monkeypatch, compiling=600.0, between=1.0)
     for total, stop in ((7, 3), (7, 4), (7, None)):
-        go(tmp_path, total, signal_at=stop, prepared=Slow(), after=wait)
+        go(tmp_path, total, signal_at=stop, prepared=slow, after=wait)
     rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     assert [(row["step"], row["loss"]) for row in rows] == [(2, 1.5), (3, 3), (4, 4), (6, 5.5), (7, 7)]
     assert common.train_seconds(tmp_path) == 3 * 600.0 + 4  # a second after each step but the last before a stop
@@ -114,18 +120,8 @@ def test_what_is_left_is_told_after_two_steps(tmp_path, capsys, monkeypatch):
 
 
 def test_compiling_is_not_taken_for_the_pace(tmp_path, capsys, monkeypatch):
-    now = [0.0]
-    monkeypatch.setattr(loop, "time", types.SimpleNamespace(time=lambda: now[0]))
-
-    class Slow(list):
-        def append(self, number):
-            now[0] += 6000.0
-
-    def wait(number, run):
-        now[0] += 60.0  # before the next step
-        return False
-
-    go(tmp_path, 6, prepared=Slow(), after=wait)
+    slow, wait = clocked(monkeypatch, compiling=6000.0, between=60.0)
+    go(tmp_path, 6, prepared=slow, after=wait)
     assert re.findall(r"step (\d) .*; (\d+) minutes left", capsys.readouterr().out) == [("2", "2"), ("4", "2"), ("6", "0")]
     rows = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
     assert [row["seconds_per_step"] for row in rows] == [3030.0, 60.0, 60.0]

@@ -60,7 +60,7 @@ def _draw_geom(kind, x, y, carry, job):
     depth, paint = carry
     new, cosine = render_shapes.cast(kind, job["geom"], x, y)
     wins = (new < depth) & (job["box"][2:] > job["box"][:2]).all()
-    paint = {name: _paint(name, wins, cosine, job["rgb"], job["id"], leaf) for name, leaf in paint.items()}
+    paint = {name: _paint(name, wins, _shade(cosine), job["rgb"], job["id"], leaf) for name, leaf in paint.items()}
     return (jnp.where(wins, new, depth), paint), None
 
 
@@ -70,10 +70,14 @@ def _rays(lens, top, left, shape):
     return x, y
 
 
-def _paint(name, wins, cosine, rgb, index, old):
+def _shade(cosine):
+    return scene.AMBIENT + scene.DIFFUSE * cosine
+
+
+def _paint(name, wins, shade, rgb, index, old):
     if name == "segmentation":
         return jnp.where(wins, index, old)
-    return jnp.where(wins[..., None], (scene.AMBIENT + scene.DIFFUSE * cosine)[..., None] * rgb, old)
+    return jnp.where(wins[..., None], shade[..., None] * rgb, old)
 
 
 def _draw_tiles(kinds, tile, image, lens, jobs):
@@ -116,10 +120,7 @@ def _nearer(start, cast, old):
 
 def _paint_visible(final, start, cast, old):
     wins = cast["depth"] <= jax.lax.dynamic_slice(final, start, (1, *cast["depth"].shape))[0] * (1 + SAME)
-    paint = {"segmentation": cast["id"]}
-    if "rgb" in old:
-        paint["rgb"] = cast["shade"][..., None] * cast["rgb"]
-    return {name: jnp.where(wins[..., None] if name == "rgb" else wins, paint[name], leaf) for name, leaf in old.items()}
+    return {name: _paint(name, wins, cast["shade"], cast["rgb"], cast["id"], leaf) for name, leaf in old.items()}
 
 
 def _over_tiles(table, tile, buffers, update):
@@ -139,8 +140,7 @@ def _over_tiles(table, tile, buffers, update):
         right = jnp.minimum(left + at % across * tile[1], width - tile[1])
         depth, cosine = render_shapes.cast(kind, geom, *_rays(lens, down, right, tile))
         start = jnp.where(number < end, jnp.stack([image, down, right]), 0)
-        shade = scene.AMBIENT + scene.DIFFUSE * cosine
-        return {"depth": jnp.where(number < end, depth, jnp.inf), "shade": shade, "rgb": rgb, "id": index, "start": start}
+        return {"depth": jnp.where(number < end, depth, jnp.inf), "shade": _shade(cosine), "rgb": rgb, "id": index, "start": start}
 
     def draw_chunk(chunk, buffers):
         cast = jax.vmap(cast_tile)(chunk * CHUNK + jnp.arange(CHUNK))

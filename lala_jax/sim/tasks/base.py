@@ -209,6 +209,11 @@ class Task:
                 continue
             yield seed, scene
 
+    def roomy_lists(self, seeds: Iterable[int]) -> tuple[list[int], list[types.Scene]]:
+        """Give what `roomy` does as two lists."""
+        pairs = list(self.roomy(seeds))
+        return [seed for seed, _ in pairs], [scene for _, scene in pairs]
+
     def _check(self, scene: types.Scene) -> None:
         """Raise ValueError, naming the field, for a scene that nothing later could make sense of."""
         count = self.num_objects + self.distractors
