@@ -17,7 +17,9 @@ import pathlib
 import re
 import shlex
 import shutil
+import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
@@ -36,7 +38,7 @@ VALID = {"local": _OPTIONS, "slurm": {**_OPTIONS, **_SLURM}}
 DEFAULTS = {"local": {"workers": 2}, "slurm": {"workers": 256}}
 _GENERIC = ("timeout_min", "gpus_per_node", "cpus_per_task", "mem_gb")  # named alike for all of submitit's executors
 _POLL = {"local": 0.1, "slurm": 5.0}  # seconds between looks at what became of the tasks
-_FAREWELL = 10.0  # seconds for workers here to end
+_FAREWELL = 60.0  # seconds for workers here to end: a training takes a step more and saves
 _LINES = 12  # of a failed worker's log that are shown
 
 
@@ -65,6 +67,8 @@ class Task:
         from lala_jax import compiling  # imports JAX, which nobody else needs here
 
         compiling.keep()
+        if os.environ.get("SUBMITIT_EXECUTOR") == "local":
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)  # what submitit passes over; training has a handler of its own
         try:
             if self.part is None:
                 return self.call()
@@ -227,6 +231,8 @@ def _run(launch: Launcher, waiting: dict[str, Task], executor: Any, folder: path
                 task, job = running.pop(name)
                 tries[name] += 1
                 result, reason = _outcome(job)
+                if reason and (found := task.found()) is not None:  # killed when all was done, or its answer is not to be seen here yet
+                    result, reason = found["result"], ""
                 if not reason:
                     print(f"{name}: done", flush=True)
                     yield name, result
@@ -282,7 +288,8 @@ def _submit(launch: Launcher, executor: Any, waiting: dict[str, Task], running: 
     if not chosen:
         return
     try:
-        jobs = executor.submit_array(chosen)
+        with _uninterrupted() if launch.name == "local" else contextlib.nullcontext():
+            jobs = executor.submit_array(chosen)
     except (errors.FailedJobError, errors.FailedSubmissionError) as error:
         if not running:
             raise options.OptionsError(f"--launcher={launch.name}: {error}") from error
@@ -294,13 +301,34 @@ def _submit(launch: Launcher, executor: Any, waiting: dict[str, Task], running: 
         print(f"{task.name}: job {job.job_id}", flush=True)
 
 
+@contextlib.contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Start processes that a terminal's Ctrl-C does not reach: submitit would kill within a second what has yet to save."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def _cancel(launch: Launcher, jobs: Sequence[Any]) -> None:
-    """Stop jobs; those of this machine are seen off."""
+    """Stop jobs. Those of this machine are told to, again and again, until they have ended: a training saves first."""
+    if launch.name != "local":
+        for job in jobs:
+            job.cancel(check=False)
+        return
+    deadline = time.time() + _FAREWELL
+    while time.time() < deadline and (left := [job for job in jobs if not job.done()]):
+        for job in left:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(int(job.job_id), signal.SIGTERM)  # submitit's process, which passes it on
+        time.sleep(1.0)
     for job in jobs:
-        job.cancel(check=False)
-    deadline = time.time() + (_FAREWELL if launch.name == "local" else 0)
-    while time.time() < deadline and not all(job.done() for job in jobs):
-        time.sleep(_POLL[launch.name])
+        if not job.done():
+            print(f"job {job.job_id} still runs and ends when it has saved", flush=True)
 
 
 def _outcome(job: Any) -> tuple[Any, str]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib.util
 import itertools
 import os
+import pathlib
 import pickle
 import re
 from collections.abc import Callable, Mapping
@@ -37,10 +38,11 @@ class PeerError(RuntimeError):
 # Processes
 
 
-def launched(environ: Mapping[str, str]) -> dict[str, Any] | None:
+def launched(environ: Mapping[str, str], *, attached: int = 0) -> dict[str, Any] | None:
     """Read from a process's environment what `jax.distributed.initialize` is to be told; None where the process is alone.
 
-    The variables of EXPLICIT come first, then a Slurm step, Open MPI, and a pod of an Indexed Job where the package `kubernetes` is
+    `attached` GPUs are on the node, which the processes there share where the environment does not say which ones they see.
+    The variables of EXPLICIT come first, then Open MPI, a Slurm step, and a pod of an Indexed Job where the package `kubernetes` is
     installed; what is not told JAX finds out itself. Raises OptionsError where a variable of EXPLICIT is missing or no number, and where
     Open MPI, from its version 5 on, does not tell where the first process is.
     """
@@ -54,18 +56,19 @@ def launched(environ: Mapping[str, str]) -> dict[str, Any] | None:
             raise options.OptionsError(f"JAX_PROCESS_ID must be from 0 to JAX_NUM_PROCESSES - 1 = {count - 1}, got {process}")
         return {"coordinator_address": address, "num_processes": count, "process_id": process} if count > 1 else None
     told: dict[str, Any]
-    if "SLURM_STEP_NODELIST" in environ:  # inside srun; a batch script by itself is one process, whatever the job's tasks
-        told = {"num_processes": _number(environ, "SLURM_STEP_NUM_TASKS" if "SLURM_STEP_NUM_TASKS" in environ else "SLURM_NTASKS")}
-        beside = environ.get("SLURM_STEP_TASKS_PER_NODE", "")  # 4 or 4(x2), where they are as many on every node
-        here = re.fullmatch(r"(\d+)(\(x\d+\))?", beside)
-        devices = _devices(environ, environ.get("SLURM_LOCALID"), here and here[1], own="SLURM_GPUS_PER_TASK" in environ)
-    elif "OMPI_COMM_WORLD_SIZE" in environ:
+    if "OMPI_COMM_WORLD_SIZE" in environ:  # before Slurm, as in JAX: mpirun within a step starts more processes than srun knows of
         told = {"num_processes": _number(environ, "OMPI_COMM_WORLD_SIZE")}
         if told["num_processes"] > 1 and "OMPI_MCA_orte_hnp_uri" not in environ:
             if address is None:
                 raise options.OptionsError(f"Open MPI 5 does not tell where the first process is: set {EXPLICIT[0]}=HOST:PORT")
             told |= {"coordinator_address": address, "process_id": _number(environ, "OMPI_COMM_WORLD_RANK")}
-        devices = _devices(environ, environ.get("OMPI_COMM_WORLD_LOCAL_RANK"), environ.get("OMPI_COMM_WORLD_LOCAL_SIZE"), own=False)
+        devices = _devices(environ, environ.get("OMPI_COMM_WORLD_LOCAL_RANK"), environ.get("OMPI_COMM_WORLD_LOCAL_SIZE"), attached)
+    elif "SLURM_STEP_NODELIST" in environ:  # inside srun; a batch script by itself is one process, whatever the job's tasks
+        told = {"num_processes": _number(environ, "SLURM_STEP_NUM_TASKS" if "SLURM_STEP_NUM_TASKS" in environ else "SLURM_NTASKS")}
+        beside = environ.get("SLURM_STEP_TASKS_PER_NODE", "")  # 4 or 4(x2), where they are as many on every node
+        here = re.fullmatch(r"(\d+)(\(x\d+\))?", beside)
+        own = "SLURM_GPUS_PER_TASK" in environ
+        devices = _devices(environ, environ.get("SLURM_LOCALID"), here and here[1], attached, own=own)
     else:
         indexed = {"KUBERNETES_SERVICE_HOST", "JOB_COMPLETION_INDEX"} <= environ.keys()
         if indexed and importlib.util.find_spec("kubernetes"):
@@ -76,17 +79,18 @@ def launched(environ: Mapping[str, str]) -> dict[str, Any] | None:
     return {**told, **devices} if told["num_processes"] > 1 else None
 
 
-def _devices(environ: Mapping[str, str], place: str | None, beside: str | None, *, own: bool) -> dict[str, Any]:
+def _devices(environ: Mapping[str, str], place: str | None, beside: str | None, attached: int, *, own: bool = False) -> dict[str, Any]:
     """Say which GPUs that a process sees are its own, where JAX, which takes the one numbered as its `place` on the node, would err.
 
     All, where it is the only one `beside` itself on the node, or where what it sees is its `own`; else an equal share of them.
     """
-    seen = next((environ[name] for name in VISIBLE if environ.get(name)), "").split(",")
+    named = next((environ[name].split(",") for name in VISIBLE if environ.get(name)), None)
+    seen = attached if named is None else len(named)
     if "JAX_LOCAL_DEVICE_IDS" in environ or None in (place, beside):
         return {}
-    if own or beside == "1" or len(seen) == 1 and seen[0]:
+    if own or beside == "1" or named is not None and seen == 1:
         return {"local_device_ids": []}  # JAX then takes them all
-    share, first = len(seen) // int(beside), int(place)
+    share, first = seen // int(beside), int(place)
     return {"local_device_ids": list(range(first * share, (first + 1) * share))} if share > 1 else {}
 
 
@@ -99,7 +103,7 @@ def _number(environ: Mapping[str, str], name: str) -> int:
 
 def initialize() -> None:
     """Join the other processes of the run where `launched` finds any; to be called before JAX is first used."""
-    told = launched(os.environ)
+    told = launched(os.environ, attached=len(list(pathlib.Path("/dev").glob("nvidia[0-9]*"))))
     if told is None or jax.distributed.is_initialized():
         return
     jax.distributed.initialize(**told)

@@ -216,13 +216,18 @@ def summary(episodes: Sequence[Episode]) -> dict:
     `first_failures` counts the incomplete episodes by what first went wrong (`first_failure`), `lost_objects` the objects that are not
     where they belong by what last happened to each (`lost_objects`), `failures_by_reason` the actions that could not be carried out.
     """
+    found = counts(episodes)
+    return {**head(found["per_episode"]), **found}
+
+
+def counts(episodes: Sequence[Episode]) -> dict:
+    """Give what of a summary needs no episode: the counts, COUNTS, and `per_episode`. For `merged`."""
     lines = [{"seed": e.seed, "score": e.score, "complete": e.complete, "actions": len(e.actions), "causes": e.causes} for e in episodes]
     causes = collections.Counter(cause for episode in episodes for cause in episode.causes)
     first = collections.Counter(first_failure(episode.causes) for episode in episodes if not episode.complete)
     lost = collections.Counter(cause for episode in episodes for cause in lost_objects(episode))
     reasons = collections.Counter(outcome.reason for episode in episodes for outcome in episode.outcomes if not outcome.ok)
     return {
-        **head(lines),
         "actions_by_cause": {cause: causes[cause] for cause in CAUSES},
         "first_failures": {cause: first[cause] for cause in (*CAUSES[1:], "none")},
         "lost_objects": {cause: lost[cause] for cause in (*CAUSES, "never moved")},
@@ -232,7 +237,7 @@ def summary(episodes: Sequence[Episode]) -> dict:
 
 
 def merged(summaries: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Give the summary of all episodes from those of parts."""
+    """Give the summary of all episodes from the `counts`, or summaries, of parts."""
     lines = [line for one in summaries for line in one["per_episode"]]
     counts = {name: collections.Counter() for name in COUNTS}
     for name, counter in counts.items():

@@ -91,17 +91,27 @@ class PolicyAgent:
 
 def evaluate(
     agent: policy.Policy, params: Any, observer: observe.Observer, *, seeds: Sequence[int], parallel: int, threads: int, strips: int = 0,
-    seed: int = 0, progress=None, places: range | None = None,
+    seed: int = 0, progress=None,
 ) -> tuple[dict[str, Any], dict[tuple[str, int], np.ndarray]]:  # fmt: skip
     """Run the closed loop on `seeds` with the real primitive: `(rollout.summary, pictures)`.
 
     The first `strips` episodes are drawn, as `("episode", 0)` and so on, and, where any are, the first `FAILURES` that score below 100,
-    as `("failure", 0)` and so on. With `places`, one of `spans`, only the seeds at these are run, bit for bit as
-    among all; failures are then numbered within. Scenes without room for all objects are passed over; raises `NoFreePose` where no other
-    is left.
+    as `("failure", 0)` and so on. Scenes without room for all objects are passed over; raises `NoFreePose` where no other is left.
     """
+    episodes, drawn = _closed_loop(
+        agent, params, observer, seeds=seeds, places=range(len(seeds)), parallel=parallel, threads=threads, strips=strips, seed=seed,
+        progress=progress,
+    )  # fmt: skip
+    _check_some(episodes, seeds)
+    return rollout.summary(episodes), drawn
+
+
+def _closed_loop(
+    agent: policy.Policy, params: Any, observer: observe.Observer, *, seeds: Sequence[int], places: range, parallel: int, threads: int,
+    strips: int, seed: int, progress,
+) -> tuple[list[rollout.Episode], dict[tuple[str, int], np.ndarray]]:  # fmt: skip
+    """Run the seeds at `places`, one of `spans`, bit for bit as among all: episodes, and pictures, with failures numbered within."""
     task, parallel, episodes, drawn, failed = observer.task, min(parallel, len(seeds)), [], {}, 0
-    places = range(len(seeds)) if places is None else places
     for start in range(places.start, places.stop, parallel):
         chunk, scenes = task.roomy_lists(seeds[start : start + parallel])
         if not chunk:
@@ -118,13 +128,12 @@ def evaluate(
         episodes += done
         if progress is not None:
             progress(min(start + parallel, places.stop) - places.start, len(places))
-    return rollout.summary(_some(episodes, seeds)), drawn
+    return episodes, drawn
 
 
-def _some(episodes: list[rollout.Episode], seeds: Sequence[int]) -> list[rollout.Episode]:
+def _check_some(episodes: Sequence[Any], seeds: Sequence[int]) -> None:
     if not episodes:
         raise base.NoFreePose(f"none of the scenes of seeds {seeds[0]} to {seeds[-1]} has a free pose for every object")
-    return episodes
 
 
 def spans(count: int, parallel: int, most: int) -> list[range]:
@@ -140,36 +149,43 @@ def baseline(name: str, observer_task, *, seeds: Sequence[int], threads: int) ->
     Scenes are passed over as in `evaluate`.
     """
     options.check_choice("agent", name, oracle.AGENTS)
-    usable, scenes = observer_task.roomy_lists(seeds)
-    agent = rollout.oracle_agent(observer_task, scenes, usable, name)
-    return rollout.summary(_some(rollout.run(observer_task, scenes, usable, agent, threads=threads), seeds))
+    episodes = _baseline_episodes(name, observer_task, seeds=seeds, threads=threads)
+    _check_some(episodes, seeds)
+    return rollout.summary(episodes)
+
+
+def _baseline_episodes(name: str, task: base.Task, *, seeds: Sequence[int], threads: int) -> list[rollout.Episode]:
+    usable, scenes = task.roomy_lists(seeds)
+    return rollout.run(task, scenes, usable, rollout.oracle_agent(task, scenes, usable, name), threads=threads) if usable else []
 
 
 def score_span(
     config, places: range, pictures_file: pathlib.Path, *, agent: str, path: str, weights: Mapping[str, Any] | None, seeds: Sequence[int]
 ) -> dict[str, Any]:
-    """Score an agent at some places of `seeds`, one of `spans`, on this process's `device`, and leave the pictures in an `.npz`.
+    """Count up how an agent does at some places of `seeds`, one of `spans`, on this process's `device`; leave the pictures in an `.npz`.
 
-    Raises CheckpointError where the checkpoint at `path` no longer holds the `weights`.
+    There may be nothing to count: scenes without room are passed over. Raises CheckpointError where the checkpoint at `path` no longer
+    holds the `weights`.
     """
     if agent != "policy":
-        found = baseline(agent, build.task(config), seeds=[seeds[place] for place in places], threads=config.data.threads)
-        return {**found, "device": jax.devices()[0].device_kind}
+        task, own = build.task(config), [seeds[place] for place in places]
+        episodes = _baseline_episodes(agent, task, seeds=own, threads=config.data.threads)
+        return {**rollout.counts(episodes), "device": jax.devices()[0].device_kind}
     built, observer = build.build_policy(config), build.observer(config)
     params = check_checkpoint(path, config, built)
     if (now := pretrained.fingerprint(path, params)) != weights:
         raise checkpoint.CheckpointError(f"{path} changed meanwhile: it holds {now}, the others scored {weights}")
-    result, drawn = evaluate(
-        built, params, observer, seeds=seeds, parallel=config.eval.parallel, threads=config.data.threads, strips=config.eval.strips,
-        seed=config.seed, progress=lambda done, total: print(f"{done} of {total} episodes", flush=True), places=places,
+    episodes, drawn = _closed_loop(
+        built, params, observer, seeds=seeds, places=places, parallel=config.eval.parallel, threads=config.data.threads,
+        strips=config.eval.strips, seed=config.seed, progress=lambda done, total: print(f"{done} of {total} episodes", flush=True),
     )  # fmt: skip
     with writers.atomic(pictures_file) as file:
         np.savez(file, **{f"{kind}-{number}": picture for (kind, number), picture in drawn.items()})
-    return {**result, "device": jax.devices()[0].device_kind}
+    return {**rollout.counts(episodes), "device": jax.devices()[0].device_kind}
 
 
 def evaluate_in_parts(launch: cluster.Launcher, config, folder: pathlib.Path, **what) -> tuple[dict[str, Any], dict[tuple[str, int], Any]]:
-    """Give what `evaluate`, or `baseline`, gives, scored by workers, and their `device`.
+    """Give what `evaluate`, or `baseline`, gives, scored by workers, and their `device`; raises as they do.
 
     The parts stay in `folder` until the caller is done with them. `what` says what is scored: `agent`, `path`, `weights` and `seeds` of
     `score_span`.
@@ -183,6 +199,7 @@ def evaluate_in_parts(launch: cluster.Launcher, config, folder: pathlib.Path, **
     found = dict(cluster.run(launch, tasks, folder))
     drawn = _gathered([task.part.with_suffix(".npz") for task in tasks]) if what["agent"] == "policy" else {}
     scored = [found[task.name] for task in tasks]
+    _check_some([line for one in scored for line in one["per_episode"]], what["seeds"])
     return {**rollout.merged(scored), "device": ", ".join(sorted({one["device"] for one in scored}))}, drawn
 
 

@@ -1,11 +1,12 @@
 """What the tests of the launcher send to workers: they find it by this module's name."""
 
+import json
 import os
 import pathlib
 import signal
 import time
 
-from lala_jax import cluster
+from lala_jax import checkpoint, cluster
 
 
 def note(path):
@@ -41,6 +42,17 @@ def stopped(path, value):
     return value
 
 
+def saves(path, seconds):
+    """Work until told to stop, then take that long to save, as training does."""
+    with checkpoint.stop_signals((signal.SIGTERM, signal.SIGINT)) as told:
+        note(path)
+        while not told():
+            time.sleep(0.01)
+        time.sleep(seconds)
+        path.with_suffix(".saved").touch()
+    raise SystemExit("stopped at step 3; the same command goes on from there")
+
+
 def programs(path):
     """Give the folder in which this process keeps compiled programs."""
     import jax
@@ -65,6 +77,14 @@ def row(row, *, base, path, times=0):
     config = row.configs(base)[0]
     summary = scoring.baseline(row.name, build.task(config), seeds=[1, 3], threads=1)
     return killed(path, {name: value for name, value in summary.items() if name != "per_episode"}, times=times)
+
+
+def killed_too_late(path, value):
+    """Leave the part, and be killed before anybody is told; as `killed` does it, the worker's own code has no say in it."""
+    note(path)
+    part = path.parent / "parts" / f"{path.name}.json"
+    part.write_text(json.dumps({"key": 0, "result": value}))
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 def span(path, meets):

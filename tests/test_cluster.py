@@ -124,13 +124,36 @@ def test_no_more_workers_than_asked_for(tmp_path):
         assert (max(begin, other) < min(end, other_end)) == (workers == 2)
 
 
+def test_a_task_that_is_killed_after_its_part_is_there_is_done(local, tmp_path, capsys):
+    tasks = [task(tmp_path, "late", cluster_tasks.killed_too_late, 6)]
+    assert dict(cluster.run(local, tasks, tmp_path / "parts")) == {"late": 6}
+    assert runs(tmp_path, "late") == [1] and "late: done" in capsys.readouterr().out
+
+
+def start_command(*arguments):
+    """`cluster.run` in a process of its own, and of a group of its own, as a terminal starts it."""
+    code = "import pickle, sys\nfrom lala_jax import cluster\nlist(cluster.run(*pickle.load(sys.stdin.buffer)))"
+    how = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "start_new_session": True}
+    command = subprocess.Popen([sys.executable, "-c", code], **how)
+    pickle.dump(arguments, command.stdin)
+    command.stdin.close()
+    return command
+
+
+def test_a_terminal_that_interrupts_lets_trainings_save(local, tmp_path):
+    """Ctrl-C goes to the command and to all that it started; saving takes longer than submitit waits."""
+    command = start_command(local, [task(tmp_path, "training", cluster_tasks.saves, 2.5)], tmp_path / "parts")
+    while not (tmp_path / "training").exists():
+        time.sleep(0.05)
+    os.killpg(command.pid, signal.SIGINT)
+    command.wait(60)
+    assert (tmp_path / "training.saved").exists() and ended(int((tmp_path / "training").read_text()))
+
+
 def test_a_command_started_again_waits_for_workers_of_the_one_that_was_killed(local, tmp_path):
     """The first command is killed once its worker runs; the second gives what that worker found."""
     slow = task(tmp_path, "slow", cluster_tasks.ran, 4, wait=4.0)
-    code = "import pickle, sys\nfrom lala_jax import cluster\nlist(cluster.run(*pickle.load(sys.stdin.buffer)))"
-    command = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    pickle.dump((local, [slow], tmp_path / "parts"), command.stdin)
-    command.stdin.close()
+    command = start_command(local, [slow], tmp_path / "parts")
     while not (tmp_path / "slow").exists():
         time.sleep(0.05)
     command.kill()
@@ -158,7 +181,6 @@ def test_workers_keep_programs_as_commands_do(local, tmp_path, monkeypatch):
 
 
 def test_who_leaves_early_takes_the_workers_along(local, tmp_path):
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # where it is ignored, workers would ignore it, too
     found = cluster.run(local, [task(tmp_path, "slow", cluster_tasks.ran, wait=600.0), task(tmp_path, "fast")], tmp_path / "parts")
     assert next(found) == ("fast", None)
     while not (tmp_path / "slow").exists():

@@ -231,6 +231,8 @@ TOLD = {"coordinator_address": "node1:1234", "num_processes": 2, "process_id": 1
         ({"OMPI_COMM_WORLD_SIZE": "4", "OMPI_MCA_orte_hnp_uri": "1.0;tcp://10.0.0.1:9"}, {"num_processes": 4}),
         ({"OMPI_COMM_WORLD_SIZE": "2", "OMPI_COMM_WORLD_RANK": "1", "JAX_COORDINATOR_ADDRESS": "node1:1234"}, TOLD),  # Open MPI 5
         ({"OMPI_COMM_WORLD_SIZE": "1"}, None),
+        # mpirun in a shell that srun started: four processes of one Slurm task
+        ({**STEP, "SLURM_STEP_NUM_TASKS": "1", "OMPI_COMM_WORLD_SIZE": "4", "OMPI_MCA_orte_hnp_uri": ""}, {"num_processes": 4}),
         ({"KUBERNETES_SERVICE_HOST": "10.0.0.1"}, None),  # any pod
         (EXPLICIT, TOLD),
         ({**STEP, **EXPLICIT}, TOLD),
@@ -272,6 +274,21 @@ def test_every_process_takes_its_own_devices(environ, devices, launcher):
         environ = {**STEP, "SLURM_LOCALID": "0" if environ["SLURM_STEP_TASKS_PER_NODE"][0] == "1" else "1", **environ}
     told = parallel.launched(environ)
     assert told.pop("num_processes") == 8 and told == ({} if devices is None else {"local_device_ids": devices})
+
+
+@pytest.mark.parametrize(
+    ("environ", "attached", "devices"),
+    [
+        ({}, 8, [4, 5, 6, 7]),
+        ({}, 2, None),  # one each, as JAX numbers them
+        ({}, 0, None),
+        (FOUR, 8, [2, 3]),  # the other four are somebody else's
+        (OWN, 8, []),
+    ],
+)
+def test_gpus_of_the_node_are_shared_where_nothing_says_which(environ, attached, devices):
+    told = parallel.launched({**STEP, "SLURM_LOCALID": "1", "SLURM_STEP_TASKS_PER_NODE": "2(x4)", **environ}, attached=attached)
+    assert told == {"num_processes": 8} | ({} if devices is None else {"local_device_ids": devices})
 
 
 @pytest.mark.parametrize(

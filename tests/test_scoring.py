@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from test_train_step import tiny_config
 
-from lala_jax import build, checkpoint, options, pictures, rollout, scoring, types
+from lala_jax import build, checkpoint, cluster, options, pictures, pretrained, rollout, scoring, types
 from lala_jax.sim import render, scene
 from lala_jax.sim.tasks import base
 
@@ -78,6 +78,29 @@ def test_scenes_without_room_are_passed_over(built, alone, monkeypatch, tmp_path
     crowd(monkeypatch, *SEEDS)
     with pytest.raises(base.NoFreePose, match="none of the scenes of seeds 1 to 5 has a free pose"):
         scoring.baseline("oracle", task, seeds=SEEDS, threads=1)
+
+
+@pytest.mark.parametrize("agent", ["policy", "blind"])
+def test_workers_pass_over_scenes_as_one_process_does(agent, built, monkeypatch, tmp_path):
+    """Also a worker all of whose scenes have no room; it is an error only where all workers' have none."""
+    config, task = tiny_config(*SINGLE, "eval.parallel=1"), built[2].task
+    monkeypatch.setattr(cluster, "run", lambda launch, tasks, folder: [(task.name, task.call()) for task in tasks])
+    monkeypatch.setattr(scoring, "check_checkpoint", lambda *given: built[1])
+    monkeypatch.setattr(pretrained, "fingerprint", lambda *given: None)
+
+    def fanned():
+        what = {"agent": agent, "path": "", "weights": None, "seeds": SEEDS}
+        return scoring.evaluate_in_parts(cluster.Launcher("local", 3), config, tmp_path, **what)[0]
+
+    crowd(monkeypatch, 1)
+    if agent == "policy":
+        alone, _ = scoring.evaluate(*built, seeds=SEEDS, parallel=1, threads=1)
+    else:
+        alone = scoring.baseline(agent, task, seeds=SEEDS, threads=1)
+    assert alone["episodes"] == 2 and {name: value for name, value in fanned().items() if name != "device"} == alone
+    crowd(monkeypatch, *SEEDS)
+    with pytest.raises(base.NoFreePose, match="none of the scenes of seeds 1 to 5 has a free pose"):
+        fanned()
 
 
 @pytest.mark.parametrize("parallel", [2, 3])  # 2 leaves an episode over, which is padded
