@@ -87,8 +87,10 @@ def main(config, workdir, *, task: str, stages: str, growth: bool, repeats: int,
 
 def judged(rows: Sequence[Mapping[str, Any]], task: str) -> dict[str, Any]:
     """Give the stages with their shares of the ceilings among them, and what they show of the targets."""
-    ceilings = benchmark_stages.CEILINGS
-    peaks = {field: row[f"{field}_per_second"] for row in rows if (field := ceilings.get(row["name"])) and f"{field}_per_second" in row}
+    peaks: dict[str, float] = {}
+    for row in rows:
+        if (field := benchmark_stages.PEAKS.get(row["name"])) and f"{field}_per_second" in row:
+            peaks[field] = max(row[f"{field}_per_second"], peaks.get(field, 0.0))
     shares = [{field: row[f"{field}_per_second"] / peak for field, peak in peaks.items() if f"{field}_per_second" in row} for row in rows]
     targets = [benchmark_targets.judged(target, rows, task, jax.default_backend()) for target in benchmark_targets.TARGETS]
     return {"stages": [{**row, "share": share} for row, share in zip(rows, shares, strict=True)], "targets": targets}
@@ -162,9 +164,11 @@ def read(path: str, flag: str = "--against") -> dict[str, Any]:
 def check_comparable(before: Mapping[str, Any], now: Mapping[str, Any], names: Sequence[str]) -> None:
     """Raise OptionsError where an earlier file is of another task or machine, or has no time of any stage in `names`.
 
-    An older file does not name its processor.
+    An older file does not name its processor, and is compared with a warning.
     """
-    there, here = (f"{one['task']} on {one['device']}" for one in (before, now))
+    there, here = (f"{one['task']} on {one['device']}, {one['processors']} processors" for one in (before, now))
+    if "processor" not in before:
+        print("--against does not name its processor: the ratios are of this code only where it ran on this machine", flush=True)
     if there == here and before.get("processor", now["processor"]) != now["processor"]:
         there, here = before["processor"], now["processor"]
     if there != here:
@@ -174,12 +178,15 @@ def check_comparable(before: Mapping[str, Any], now: Mapping[str, Any], names: S
 
 
 def slower(before: Mapping[str, Any], after: Mapping[str, Any], limit: float) -> list[str]:
-    """Print the ratio of each stage's medians, after to before, and name the stages above `limit` and those that no longer run."""
+    """Print the ratio of each stage's medians, after to before, and name the stages above `limit` and those that no longer run.
+
+    The ceilings are printed, too, but judged not: no code of ours changes them.
+    """
     old = {row["name"]: row["seconds"] for row in before["stages"] if "seconds" in row}
     lost = {row["name"]: row["unavailable"] for row in after["stages"] if row.get("failed") and row["name"] in old}
     ratios = {row["name"]: row["seconds"] / old[row["name"]] for row in after["stages"] if "seconds" in row and row["name"] in old}
     print(common.table(["stage", "time, ratio"], [[name, f"{ratio:.2f}"] for name, ratio in ratios.items()]))
-    found = [name for name, ratio in ratios.items() if ratio > limit]
+    found = [name for name, ratio in ratios.items() if ratio > limit and name not in benchmark_stages.CEILINGS]
     if found:
         print(f"more than {limit} times as long: {', '.join(found)}")
     for name, why in lost.items():

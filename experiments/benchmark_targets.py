@@ -31,6 +31,11 @@ def ratio(row: Row, other: Row, *, field: str = "seconds") -> float:
     return row[field] / other[field]
 
 
+def least_ratio(row: Row, again: Row, other: Row, *, field: str = "seconds") -> float:
+    """Compare with the better of two ways of one thing."""
+    return min(row[field], again[field]) / other[field]
+
+
 def seconds(row: Row, *, of: int = 1) -> float:
     return of * row["seconds"]
 
@@ -41,15 +46,15 @@ def again(*rows: Row) -> float:
 
 cpu, gpu = (functools.partial(Target, platform=platform) for platform in ("cpu", "gpu"))
 times = functools.partial(cpu, unit="times", compute=ratio, at_least=True)
-BOTH = ("train-paper-torch", "train-paper-network")
+BOTH = ("train-paper-torch", "train-paper-torch-given-back", "train-paper-network")
 LARGE = ("train-paper-bfloat16",)
 TARGETS = (
     times("mujoco.Renderer's time over ours, 4 views of 640 x 480", 10, stages=("render-mujoco", "render")),
     cpu("render, unproject and fuse an observation, batch 8", 0.025, "s", ("observe",), seconds),
     times("conv2d of PyTorch, time over our correlation's", 20, stages=("correlate-torch", "correlate")),
     times("direct convolution of JAX, likewise", 20, stages=("correlate-direct", "correlate")),
-    times("paper's step in PyTorch, time over ours", 6, stages=BOTH),
-    times("paper's step in PyTorch, memory over ours", 1, stages=BOTH, compute=functools.partial(ratio, field="process_memory")),
+    times("paper's step in PyTorch, time over ours", 6, stages=BOTH, compute=least_ratio),
+    times("paper's step in PyTorch, memory over ours", 1, stages=BOTH, compute=functools.partial(least_ratio, field="process_memory")),
     gpu("paper's step in bfloat16, a sample", 0.01, "s", LARGE, seconds),
     gpu("20,000 samples of it", 240, "s", LARGE, functools.partial(seconds, of=20_000)),
     gpu(

@@ -21,6 +21,7 @@ import numpy as np
 from lala_jax import compiling, options
 
 WARM, SECONDS = 5.0, 20.0  # after so long a stage is warm, and is not repeated again
+LEAST = 3  # runs of a median, if so many are asked for, however long they take
 ONCE = 60.0  # seconds of a first run that stays the only one
 LIMIT = 900.0  # seconds that a process of its own may take
 COMPILED = "/jax/core/compile/backend_compile_duration"  # what JAX says when it has compiled a program, or read a kept one
@@ -79,7 +80,7 @@ def stepping(step, run: Any, *inputs: Any, count: int = 1) -> Work:
 
 
 def measured(work: Work, repeats: int) -> dict[str, Any]:
-    """Run some work up to `repeats` times, for SECONDS, after as many to warm up, for WARM: seconds a thing, and rates.
+    """Run some work up to `repeats` times, LEAST or for SECONDS, after as many to warm up, for WARM: seconds a thing, and rates.
 
     One run is not enough to warm up: it may be the fifth that finds all its memory kept. A first run of over ONCE is the only one,
     as is that of work that is `cold`.
@@ -99,7 +100,7 @@ def measured(work: Work, repeats: int) -> dict[str, Any]:
                     break
                 clocked()
             runs, begin = [], time.perf_counter()
-            while len(runs) < repeats and (not runs or time.perf_counter() - begin < SECONDS):
+            while len(runs) < repeats and (len(runs) < LEAST or time.perf_counter() - begin < SECONDS):
                 runs.append(clocked())
         work.more()
     runs = [seconds / work.count for seconds in runs]
@@ -165,7 +166,7 @@ def alone(name: str, stage: Stage, config, repeats: int) -> dict[str, Any]:
         raise Unavailable(f"ended with status {done.returncode}: {last[:300]}", failed=True)
     row = json.loads(done.stdout.splitlines()[-1])
     if "unavailable" in row:
-        raise Unavailable(row["unavailable"])
+        raise Unavailable(row["unavailable"], failed=row.get("failed", False))
     return row
 
 
@@ -191,7 +192,7 @@ def serve(stages: Mapping[str, Stage]) -> None:
         if before is not None and faults_of_children() == others:
             row["process_memory"] = memory("VmHWM") - before
     except Unavailable as error:
-        row = {"unavailable": str(error)}
+        row = {"unavailable": str(error), **({"failed": True} if error.failed else {})}
     print(f"\n{json.dumps(row)}", flush=True)
 
 
