@@ -14,6 +14,7 @@ import itertools
 import json
 import math
 import pathlib
+import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
@@ -104,15 +105,19 @@ def is_same(stored: Mapping[str, Any], wanted: Mapping[str, Any]) -> bool:
     """Say whether a stored row is the result of the wanted identity; what makes no difference may differ, and new fields may be missing."""
     stored = {"revision": 0, "beside": {}, **stored}
     exact = all(stored[name] == wanted[name] for name in ("overrides", "revision", "seeds", "checkpoint", "beside"))
-    return exact and _alike(stored["config"], wanted["config"])
+    return exact and _alike(stored["config"], wanted["config"], trains=wanted["checkpoint"] is None)
 
 
-def _alike(there: Mapping[str, Any], here: Mapping[str, Any]) -> bool:
-    """Say whether two configs, one of which may be older than some fields, give the same result."""
+def _alike(there: Mapping[str, Any], here: Mapping[str, Any], *, trains: bool) -> bool:
+    """Say whether two configs, one of which may be older than some fields, give the same result.
+
+    What `trains` may learn something else from another directory, also where as many demonstrations of the same task lie there.
+    """
 
     def settings(config):
         fields = options.fields(config)
         more = CHOOSES if not any(fields[name] for name in ERRS if name in fields) else (*CHOOSES, "eval.parallel")
+        more = (*more, "data.directory") if trains else more
         return build.run_settings(config) | {name: fields[name] for name in more if name in fields}
 
     first, second = settings(there), settings(here)
@@ -126,7 +131,7 @@ def belongs(stored: Mapping[str, Any], config, seeds: Sequence[int], weights: Ma
     except options.OptionsError:  # it changes a field that is no more
         return False
     named = writers.plain({"seeds": [seeds[0], seeds[-1]], "checkpoint": weights})
-    return all(stored[name] == value for name, value in named.items()) and _alike(stored["config"], own)
+    return all(stored[name] == value for name, value in named.items()) and _alike(stored["config"], own, trains=weights is None)
 
 
 def fill(
@@ -147,8 +152,7 @@ def fill(
     A row of the file with a row's name and another `identity` is run again and replaced, other rows stay. `finish(done, kept)` may
     add to the rows that are `done`, in the order of `rows`, and gives the file's other fields; `kept` are all rows of the file that
     belong to the same config, seeds and weights, also those not asked for, but for old revisions of `known` rows. With `launch` the
-    rows are run by workers, after what they share, `before`; where some are missing in the end, the file holds the others, and
-    SystemExit is raised.
+    rows are run by workers, after what they share, `before`. Where some fail, the file holds the others, and SystemExit is raised.
     """
     writers.make_directory(path.parent)
     stored = read(path)
@@ -207,9 +211,24 @@ def outcome(row: Row, run: Callable[[Any], Mapping[str, Any]], own: Mapping[str,
 
 
 def _here(rows, found, run, wanted) -> Iterator[tuple[Row, dict[str, Any]]]:
-    """Yield the rows in order, those that are not `found` after running them."""
+    """Yield the rows in order, those that are not `found` after running them; where some fail, SystemExit after the last."""
+    missing: dict[str, str] = {}
     for row in rows:
-        yield row, found[row.name] if row.name in found else outcome(row, run, wanted[row.name])
+        if row.name in found:
+            yield row, found[row.name]
+        elif lost := [need for need in row.needs if need in missing]:
+            missing[row.name] = f"it needs {lost[0]}, which is missing"
+        else:
+            try:
+                result = outcome(row, run, wanted[row.name])
+            except (*USER_ERRORS, jax.errors.JaxRuntimeError) as error:  # it diverges, or takes more memory than there is
+                missing[row.name] = str(error)
+                print(f"{row.name}: {error}", file=sys.stderr, flush=True)
+                continue
+            yield row, result
+    if missing:
+        told = "\n".join(f"  {name}: {reason.partition(chr(10))[0]}" for name, reason in missing.items())
+        raise SystemExit(f"{len(missing)} of {len(rows)} rows are missing; the same command runs them again, the others are kept\n{told}")
 
 
 def _fanned(launch, path, rows, found, run, wanted, before) -> Iterator[tuple[Row, dict[str, Any]]]:

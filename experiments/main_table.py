@@ -39,6 +39,7 @@ def main(
         return {"task": task, "split": split, "means": means(kept)}
 
     path = pathlib.Path(out or f"experiments/results/{task}") / "main.json"
+    common.check_held(path, {"task": task, "split": split})
     work, before = functools.partial(run, base=base, runs=build.workdir(config, workdir)), common.recordings(rows, base)
     done = common.fill(path, rows, work, finish, config=base, seeds=scored, launch=launch, before=before)
     print(f"\n{table(done)}\n\n{path}")

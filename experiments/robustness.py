@@ -73,6 +73,7 @@ def main(
         return {**facts, "reference": chosen[0].name, "conditions": conditions}
 
     path = pathlib.Path(out or f"experiments/results/{name}") / f"robustness-{split}.json"
+    common.check_held(path, {"task": name})
     loaded = params if launch is None else None
     work = functools.partial(run, base=config, checkpoint=checkpoint, weights=weights, seeds=seeds, params=loaded)
     done = common.fill(path, chosen, work, finish, config=config, seeds=seeds, weights=weights, launch=launch, known=known)

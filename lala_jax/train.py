@@ -8,11 +8,14 @@ for bit. Several devices share every batch, and the processes that a scheduler s
 from __future__ import annotations
 
 import functools
+import json
 import pathlib
+import zlib
 from collections.abc import Mapping
 from typing import Any
 
 import jax
+import numpy as np
 
 from lala_jax import (
     build,
@@ -43,6 +46,22 @@ def load_states(config: Mapping[str, Any], mesh: jax.sharding.Mesh | None = None
     directory = parallel.first(lambda: recording.collect(config))
     demos, _ = dataset.load(directory, count=config["data"]["demos"], **build.data_identity(config))
     return parallel.place(types.State(**dataset.stack(demos)), mesh)
+
+
+def data_fingerprint(states: types.State) -> dict[str, int]:
+    """Say in numbers which training states these are: how many, and the checksum of their bytes."""
+    leaves = [np.ascontiguousarray(leaf) for leaf in jax.tree.leaves(jax.device_get(states))]
+    return {"states": len(leaves[0]), "crc32": functools.reduce(lambda crc, leaf: zlib.crc32(leaf.tobytes(), crc), leaves, 0)}
+
+
+def _note_start(config, out: pathlib.Path, learnt: Mapping[str, int], *, resumed: bool) -> None:
+    """Write the config and what is learnt from; raises CheckpointError where a run that is `resumed` has learnt from something else."""
+    path = out / "demonstrations.json"
+    if resumed and path.exists() and json.loads(path.read_text()) != learnt:
+        text = f"{out} holds a run that learnt from other demonstrations than those in {config.data.directory}: choose another --workdir"
+        raise checkpoint.CheckpointError(text)
+    writers.write_json(path, learnt)
+    writers.write_json(out / "config.json", options.to_dict(config))
 
 
 def fresh(recipe: train_step.Recipe, seed: int) -> state.TrainState:
@@ -76,7 +95,8 @@ def _train_and_evaluate(config, recipe: train_step.Recipe, out: pathlib.Path) ->
     states = load_states(config, recipe.mesh)
     store = checkpoint.Checkpoints(out / "checkpoints")
     run = start_or_resume(config, recipe, store)
-    parallel.first(lambda: writers.write_json(out / "config.json", options.to_dict(config)))
+    learnt = data_fingerprint(parallel.here(states, recipe.mesh))
+    parallel.first(lambda: _note_start(config, out, learnt, resumed=int(run.step) > 0))
     count = state.parameter_count(run.params)
     shared = "" if recipe.mesh is None else f", {recipe.mesh.size} devices"
     parallel.say(f"{config.task.name}: {count:,} parameters, {states.size.shape[0]} states, step {int(run.step)}{shared}")

@@ -302,7 +302,7 @@ def test_two_files_are_compared_by_ratio(monkeypatch, tmp_path, capsys):
     whole = path.read_bytes()
     for other, message in (
         ({"task": "pallet"}, "--against holds pallet on cpu, "),
-            ({"processors": 96}, "--against holds tower on cpu, 96 processors, this is tower on cpu, "),
+        ({"processors": 96}, "--against holds tower on cpu, 96 processors, this is tower on cpu, "),
         ({"processor": "a slow one"}, f"--against holds a slow one, this is {stored['processor']}: their ratio says nothing"),
         ({"stages": stored["stages"][:2]}, "--against holds times of none of the stages b"),
     ):  # before anything is timed

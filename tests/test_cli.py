@@ -80,7 +80,7 @@ def test_the_same_command_again_finds_it_complete(trained, call):
     assert contents(workdir / "checkpoints") == before
 
 
-def test_another_setting_needs_another_workdir(trained, call):
+def test_another_setting_needs_another_workdir(trained, call, tmp_path):
     data, workdir, _ = trained
     before = (workdir / "config.json").read_bytes()
     refused(
@@ -89,6 +89,13 @@ def test_another_setting_needs_another_workdir(trained, call):
     )
     answer = call("lala_jax.train", f"--workdir={workdir}", *tiny(data, "model.width=8"))
     refused(answer, r"another model.width \(\d+ there, 8 here\): choose another --workdir")
+    demos, meta = dataset.load(data)
+    dataset.save(tmp_path / "own", demos[::-1], task=meta["task"], task_options=meta["task_options"])
+    answer = call("lala_jax.train", f"--workdir={workdir}", *tiny(tmp_path / "own"))
+    refused(answer, rf"learnt from other demonstrations than those in {tmp_path / 'own'}: choose another --workdir")
+    shutil.copytree(data, tmp_path / "moved")
+    assert call("lala_jax.train", f"--workdir={workdir}", *tiny(tmp_path / "moved")).status == 0
+    assert call("lala_jax.train", f"--workdir={workdir}", *tiny(data)).status == 0
     assert (workdir / "config.json").read_bytes() == before
 
 

@@ -14,7 +14,7 @@ from test_scoring import SINGLE, save
 from test_train_step import tiny_config
 
 from experiments import ablation, common, main_table, robustness, table1
-from lala_jax import build, checkpoint, observe, options, rollout, train, writers
+from lala_jax import build, checkpoint, loop, observe, options, rollout, train, writers
 from lala_jax.sim import scene, tasks
 from lala_jax.sim.tasks import base as task_base
 from lala_jax.sim.tasks import tower
@@ -101,13 +101,13 @@ def test_rows_are_chosen_by_name():
 # Rows that are kept
 
 
-def filled(path, config, *rows, weights=None, fails=()):
+def filled(path, config, *rows, weights=None, fails=(), error=KeyboardInterrupt):
     """Fill a file with rows of changes to `config`: what was run, and the rows."""
     ran = []
 
     def work(row):
         if row.name in fails:
-            raise KeyboardInterrupt
+            raise error
         ran.append(row.name)
         return {"score": 50.0}
 
@@ -154,6 +154,18 @@ def test_finished_rows_are_kept_and_changed_ones_run_again(tmp_path, capsys):
     assert json.loads(path.read_text())["kept"] == ["a", "c"]
 
 
+@pytest.mark.parametrize("error", [loop.NonFiniteError("step 7: loss is nan"), jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: too much")])
+def test_a_row_that_fails_leaves_the_others(error, tmp_path):
+    """As with workers: all others are run, but those that need it, and the command says what is missing."""
+    path, config = tmp_path / "rows.json", tiny_config()
+    rows = [common.Row("a", "a"), common.Row("b", "b", needs=("a",)), common.Row("c", "c")]
+    with pytest.raises(SystemExit, match="2 of 3 rows are missing; .*\n  a: .*\n  b: it needs a, which is missing") as left:
+        filled(path, config, *rows, fails=("a",), error=error)
+    assert str(error).partition(":")[0] in str(left.value)
+    assert [row["name"] for row in json.loads(path.read_text())["rows"]] == ["c"]
+    assert filled(path, config, *rows)[0] == ["a", "b"]
+
+
 def test_what_identifies_a_row(tmp_path):
     path, row = tmp_path / "rows.json", common.Row("a", "a")
     weights = {"step": 3, "crc32": 7}
@@ -167,7 +179,10 @@ def test_what_identifies_a_row(tmp_path):
     assert ran(tiny_config(moved)) and not ran(tiny_config(moved, "data.threads=2")) and ran()
     assert ran(tiny_config(moved)) and ran(tiny_config(moved, "eval.parallel=3")) and ran()  # how the cameras err is drawn otherwise
     assert ran(tiny_config("train.eval_every=7")) and ran()  # another checkpoint may be the best
-    assert ran(weights=weights) and not ran(weights=dict(weights)) and ran(weights={**weights, "crc32": 8}) and ran()
+    elsewhere = tiny_config("data.directory=elsewhere")  # as many demonstrations, maybe others
+    assert ran(elsewhere) and not ran(elsewhere) and ran()
+    assert ran(weights=weights) and not ran(elsewhere, weights=dict(weights))
+    assert not ran(weights=dict(weights)) and ran(weights={**weights, "crc32": 8}) and ran()
     older = json.loads(path.read_text())
     del older["rows"][0]["config"]["model"]["max_height"]  # the row is older than a field
     path.write_text(json.dumps(older))
@@ -423,6 +438,31 @@ def test_the_table_holds_every_row_of_both_tasks(trains, monkeypatch, tmp_path, 
     assert named == [entry.label for entry in table1.ROWS if entry.name in ("two-stream", "top_view")]
 
 
+def test_the_table_is_written_of_what_is_there_when_a_row_fails(trains, monkeypatch, tmp_path):
+    ran = train.train_and_evaluate
+
+    def fails(config, workdir):
+        if config.model.name == "two_stream":
+            raise loop.NonFiniteError("step 7: loss is nan")
+        return ran(config, workdir)
+
+    monkeypatch.setattr(train, "train_and_evaluate", fails)
+    with pytest.raises(SystemExit, match="two-stream: step 7: loss is nan"):
+        table1.command(["--scale=smoke", "--rows=two-stream,graph", f"--workdir={tmp_path / 'runs'}", f"--out={tmp_path}"])
+    assert "graph policy on true poses" in (tmp_path / "smoke.md").read_text()
+
+
+def test_the_results_of_two_tasks_are_not_mixed_in_one_file(trains, tmp_path, capsys):
+    """Where --out is one directory for both; nothing is trained, nothing lost."""
+    given = ["--demos=10", "--seeds=0", "--episodes=2", f"--workdir={tmp_path / 'runs'}", f"--out={tmp_path}"]
+    main_table.command([*given, "--task=tower"])
+    held = (tmp_path / "main.json").read_bytes()
+    with pytest.raises(SystemExit, match="2"):
+        main_table.command([*given, "--task=pallet"])
+    assert "main.json holds rows of --task=tower: give another --out" in capsys.readouterr().err
+    assert (tmp_path / "main.json").read_bytes() == held and len(trains) == 1
+
+
 def test_a_row_says_what_it_ran_and_what_its_backbone_cost(trains, monkeypatch, tmp_path):
     def fake(config, workdir):
         with writers.Writer(workdir, tensorboard=False) as writer:
@@ -455,8 +495,7 @@ def test_rows_are_compared_with_others_that_have_what_they_are_compared_in():
     rows = {row.name: row for row in table1.ROWS}
     compared = [row for row in table1.ROWS if row.against]
     assert {row.name for row in compared} >= {name for name in rows if name.startswith(("ours-one", "ours-no", "two-stream-"))}
-    for row in compared:
-        other = rows[row.against]
+    for row, other in ((one, rows[name]) for one in compared for name in one.against):
         assert set(row.tasks) <= set(other.tasks or tasks.names()) and not other.tasks and other.agent == row.agent == "policy"
         assert row.family == other.family or row.name == "graph"
 
