@@ -56,7 +56,7 @@ def task(config: Mapping[str, Any]) -> base.Task:
     options.check_choice("task.colors", fields["colors"], base.COLOR_CHOICES)
     number = {"num_objects": fields["num_objects"]} if fields["num_objects"] else {}
     try:
-        return tasks.get(fields["name"], colors=fields["colors"], distractors=_newer(config, "task.distractors"), **number)
+        return tasks.get(fields["name"], colors=fields["colors"], distractors=newer(config, "task.distractors"), **number)
     except (ValueError, TypeError) as error:
         raise options.OptionsError(str(error)) from error
 
@@ -75,7 +75,7 @@ def data_identity(config: Mapping[str, Any]) -> dict[str, Any]:
 
 def mistakes(config: Mapping[str, Any]) -> float:
     """Give the share of the demonstrations' actions that are spoiled."""
-    share = _newer(config, "data.mistakes")
+    share = newer(config, "data.mistakes")
     if not 0.0 <= share < 1.0:
         raise options.OptionsError(f"config field data.mistakes must be at least 0 and below 1, got {share!r}")
     return share
@@ -109,7 +109,7 @@ def observer(config: Mapping[str, Any]) -> observe.Observer:
 
 def surface(config: Mapping[str, Any]) -> int:
     """Give the number of pretrained features that the map's surface has; 0 without a backbone."""
-    name, stage = (_newer(config, field) for field in ("camera.backbone", "camera.stage"))
+    name, stage = (newer(config, field) for field in ("camera.backbone", "camera.stage"))
     if not name:
         return 0
     options.check_choice("camera.stage", stage, resnet.STAGES)
@@ -127,7 +127,7 @@ def backbone_identity(config: Mapping[str, Any]) -> dict[str, str]:
 
 def network_dtype(config: Mapping[str, Any]) -> str:
     """Give the type that networks compute in, the backbone among them."""
-    return options.check_choice("model.dtype", _newer(config, "model.dtype"), DTYPES)
+    return options.check_choice("model.dtype", newer(config, "model.dtype"), DTYPES)
 
 
 def build_policy(config: Mapping[str, Any]) -> policy.Policy:
@@ -173,7 +173,7 @@ def build_policy(config: Mapping[str, Any]) -> policy.Policy:
 def clip_files(config: Mapping[str, Any]) -> dict[str, Any]:
     """Give CLIP's `weights`, its `tokenizer` and how many `stages` of its trunk cliport takes, where the config names its files."""
     fields = config["model"]
-    weights, tokenizer, stages = (_newer(config, f"model.{name}") for name in ("clip", "clip_tokenizer", "clip_stages"))
+    weights, tokenizer, stages = (newer(config, f"model.{name}") for name in ("clip", "clip_tokenizer", "clip_stages"))
     if not (weights or tokenizer or stages):
         return {}
     if fields["name"] != "cliport":
@@ -193,7 +193,7 @@ def clip_identity(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _mix(config: Mapping[str, Any]) -> float:
-    return _share("augment.mix", _newer(config, "augment.mix"))
+    return _share("augment.mix", newer(config, "augment.mix"))
 
 
 def _check_names(config: Mapping[str, Any]) -> None:
@@ -281,7 +281,7 @@ def on_devices(recipe: Recipe, config: Mapping[str, Any], *, group: str) -> Reci
     mesh = parallel.mesh(f"{group}.batch_size", recipe.batch_size)
     if mesh is None:
         return recipe
-    return dataclasses.replace(recipe, mesh=mesh, shard_state=_newer(config, "train.shard_state"))
+    return dataclasses.replace(recipe, mesh=mesh, shard_state=newer(config, "train.shard_state"))
 
 
 def pretrain_recipe(config: Mapping[str, Any]) -> pretrain_step.Recipe:
@@ -358,7 +358,7 @@ def split_seeds(split: str, start: int, count: int) -> list[int]:
     return seeds
 
 
-def _newer(config: Mapping[str, Any], name: str) -> Any:
+def newer(config: Mapping[str, Any], name: str) -> Any:
     """Read a field that configs in checkpoints may be older than."""
     group, field = name.split(".")
     return config[group].get(field, defaults.NEWER[name])

@@ -10,7 +10,7 @@ import ml_collections
 ARGUMENTS = ("", "smoke", "paper")
 # What configs in checkpoints and results that are older than a field mean.
 NEWER = {
-    **{"task.distractors": 0, "data.mistakes": 0.0, "augment.mix": 0.5, "train.shard_state": False},
+    **{"task.distractors": 0, "data.mistakes": 0.0, "augment.mix": 0.5, "train.shard_state": False, "train.start": ""},
     **{"camera.backbone": "", "camera.stage": "conv2"},
     **{"model.clip": "", "model.clip_tokenizer": "", "model.clip_stages": 0, "model.dtype": "float32"},
 }
@@ -92,6 +92,7 @@ def get(arg: str, *, task: str) -> ml_collections.ConfigDict:
     config.train = ml_collections.ConfigDict()
     config.train.steps = 1600
     config.train.batch_size = 8
+    config.train.start = ""  # weights to begin with: pretrained/NAME, or a run's checkpoints; none: random ones
     config.train.log_every = 20  # steps
     config.train.save_every = 200
     config.train.eval_every = 800

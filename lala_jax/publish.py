@@ -237,7 +237,8 @@ def _pretrained(config: Mapping[str, Any]) -> str:
         parts = [f"features of {camera['backbone']} ({camera['stage']})"]
     if model["name"] == "cliport":
         parts = [f"CLIP's towers ({model['clip']})"] if model.get("clip") else [f"features of {encoders.TRUNK}", "MiniLM's sentences"]
-    return f"but frozen pretrained parts: {', '.join(parts)}" if parts else "no pretrained parts"
+    begun = f"; begun from the weights {start}" if (start := config["train"].get("start")) else ""
+    return (f"but frozen pretrained parts: {', '.join(parts)}" if parts else "no pretrained parts") + begun
 
 
 def model_card(card: Mapping[str, Any]) -> str:
@@ -273,7 +274,8 @@ def model_card(card: Mapping[str, Any]) -> str:
         f"parameters, the moving average after {card['step']} of {training['steps']} steps.{rounding}",
         "## Intended use",
         f"The simulated task `{data['task']}` of lala_jax with {data['objects']} objects{more}, colours `{data['colors']}`, cameras "
-        f"`{camera['preset']}` at {camera['height']} x {camera['width']} pixels: research, comparison, a start for further training.",
+        f"`{camera['preset']}` at {camera['height']} x {camera['width']} pixels: research, comparison, a start for further training "
+        "(`--config.train.start`).",
         "```bash\n" + card["commands"]["evaluate"] + "\n```",
         "repeats the first score below and says whether it is the same.",
         "## Data and training",

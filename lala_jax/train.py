@@ -69,12 +69,22 @@ def fresh(recipe: train_step.Recipe, seed: int) -> state.TrainState:
     return state.create(compiling.draw(recipe.policy.init, seed), recipe.optimizer)
 
 
-def start_or_resume(config: Mapping[str, Any], recipe: train_step.Recipe, store: checkpoint.Checkpoints) -> state.TrainState:
-    """Make a fresh state, or restore the newest intact one; raises CheckpointError where it is of a run with other settings.
+def weights_to_start(config: Mapping[str, Any], recipe: train_step.Recipe) -> Any:
+    """Read the parameters at `train.start`, checked against the policy; None where the config names none."""
+    path = build.newer(config, "train.start")
+    return scoring.check_checkpoint(path, config, recipe.policy) if path else None
 
-    Files of pretrained weights may have been moved meanwhile: what is in them counts.
+
+def start_or_resume(
+    config: Mapping[str, Any], recipe: train_step.Recipe, store: checkpoint.Checkpoints, weights: Any = None
+) -> state.TrainState:
+    """Make a fresh state, of `weights` where there are any, or restore the newest intact one.
+
+    Raises CheckpointError where that is of a run with other settings. Files of pretrained weights may have been moved meanwhile: what is
+    in them counts.
     """
-    begun, frozen = fresh(recipe, config["seed"]), build.clip_identity(config) | build.backbone_identity(config)
+    begun = fresh(recipe, config["seed"]) if weights is None else state.create(weights, recipe.optimizer)
+    frozen = build.clip_identity(config) | build.backbone_identity(config)
     files = {field for name in frozen for field in build.FILES[name]}
 
     def settings(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -87,14 +97,15 @@ def train_and_evaluate(config, workdir: str) -> dict[str, Any]:
     """Run everything a config describes; returns the final evaluation. Waits for another command that has the same work directory."""
     out = pathlib.Path(workdir)
     recipe = build.on_devices(build.recipe(config), config, group="train")
+    weights = weights_to_start(config, recipe)  # before hours of recording, whether they will do
     with loop.alone(out):
-        return _train_and_evaluate(config, recipe, out)
+        return _train_and_evaluate(config, recipe, out, weights)
 
 
-def _train_and_evaluate(config, recipe: train_step.Recipe, out: pathlib.Path) -> dict[str, Any]:
+def _train_and_evaluate(config, recipe: train_step.Recipe, out: pathlib.Path, weights: Any) -> dict[str, Any]:
     states = load_states(config, recipe.mesh)
     store = checkpoint.Checkpoints(out / "checkpoints")
-    run = start_or_resume(config, recipe, store)
+    run = start_or_resume(config, recipe, store, weights)
     learnt = data_fingerprint(parallel.here(states, recipe.mesh))
     parallel.first(lambda: _note_start(config, out, learnt, resumed=int(run.step) > 0))
     count = state.parameter_count(run.params)

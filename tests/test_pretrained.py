@@ -343,6 +343,7 @@ def test_the_card_names_what_others_trained():
         ({}, "no other data, no pretrained parts. "),
         ({"camera": {"backbone": "mine.npz", "stage": "conv2"}}, "but frozen pretrained parts: features of mine.npz (conv2). "),
         ({"model": {"name": "cliport"}}, "but frozen pretrained parts: features of resnet50_imagenet_v1, MiniLM's sentences. "),
+        ({"train": {"start": "pretrained/tower"}}, "no pretrained parts; begun from the weights pretrained/tower. "),
         ({"model": {"name": "cliport", "clip": "RN50.npz"}}, "but frozen pretrained parts: CLIP's towers (RN50.npz). "),
     ):
         config = {**card["config"], **{group: card["config"][group] | own for group, own in changes.items()}}

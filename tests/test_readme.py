@@ -6,9 +6,11 @@ import json
 import pathlib
 import re
 
+import jax
+import numpy as np
 import pytest
 
-from lala_jax import defaults, options, rollout
+from lala_jax import build, dataset, defaults, options, recording, rollout
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "experiments" / "results"
@@ -31,6 +33,18 @@ def test_the_notebook_builds_a_tower():
     assert said.getvalue() == "100.0\n"
     assert names["seen"].features.shape == (320, 160, 14, 3) and names["views"].depth.shape == (4, 240, 320)
     assert names["heatmaps"].pick.shape == (160, 80) and names["heatmaps"].place.shape == (36, 160, 80)
+
+
+def test_a_robots_demonstrations_are_written(tmp_path):
+    """The functions as they stand there, given what was measured in MuJoCo: the data set is that of the recording."""
+    (cell,), names = re.findall(r"```python\n(.*?)```", section("Training on a robot's demonstrations"), re.S), {}
+    exec(cell, names)
+    ((demo,),) = (recording.demonstrate(names["task"], [4], threads=1),)
+    fields = {name: getattr(demo.scene, name) for name in ("size", "color", "base", "goal", "symmetry")}
+    action = {name: getattr(demo.action, name) for name in ("pick", "place", "yaw")}
+    names["write"](tmp_path / "own", [names["demonstration"](4, **fields, poses=demo.poses, **action)])
+    (found,), _ = dataset.load(tmp_path / "own", **build.data_identity(names["config"]))
+    jax.tree.map(np.testing.assert_array_equal, found, demo)
 
 
 FILES = [f"{task}/{name}.json" for task in ("tower", "pallet") for name in ("main", "robustness-test")] + ["ablation/ablation-pallet.json"]

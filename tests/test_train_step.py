@@ -146,6 +146,30 @@ def test_a_run_with_other_settings_is_not_continued(tmp_path):
         train.start_or_resume(tiny_config("optim.learning_rate=0.002"), recipe(), store)
 
 
+def test_a_run_begins_with_weights_that_are_there(tmp_path):
+    """`train.start`: at step 0, with a fresh optimiser, a checkpoint's averaged parameters; once begun, a run goes on with its own."""
+    trained = start()
+    trained = trained.replace(average=jax.tree.map(lambda leaf: leaf + 1.0, trained.params), step=jnp.int32(7))
+    config, spec = tiny_config(), build.input_spec(tiny_config())
+    checkpoint.Checkpoints(tmp_path / "there").save_best(7, trained, 50.0, config=options.to_dict(config), input_spec=spec)
+    config = tiny_config(f"train.start={tmp_path / 'there'}")
+    weights, store = train.weights_to_start(config, recipe()), checkpoint.Checkpoints(tmp_path / "own")
+    run = train.start_or_resume(config, recipe(), store, weights)
+    assert int(run.step) == 0
+    expected = state.create(jax.device_get(trained.average), recipe().optimizer)
+    assert bits(run) == bits(expected)
+    store.save_latest(3, start().replace(step=jnp.int32(3)), config=options.to_dict(config), input_spec={})
+    assert bits(train.start_or_resume(config, recipe(), store, weights)) == bits(start().replace(step=jnp.int32(3)))
+    with pytest.raises(checkpoint.CheckpointError, match="another train.start"):
+        train.start_or_resume(tiny_config(), recipe(), store)
+    assert train.weights_to_start(tiny_config(), recipe()) is None
+    with pytest.raises(checkpoint.CheckpointError, match="nowhere"):
+        train.weights_to_start(tiny_config("train.start=nowhere"), recipe())
+    with pytest.raises(checkpoint.MismatchError, match="is of another model: "):
+        other = tiny_config(f"train.start={tmp_path / 'there'}", "model.width=6")
+        train.weights_to_start(other, build.recipe(other))
+
+
 def test_the_average_follows_the_parameters():
     """Early on the decay is (1 + step) / (10 + step), so that the start is forgotten."""
     optimizer = optax.sgd(0.5)
