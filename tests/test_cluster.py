@@ -132,7 +132,8 @@ def test_a_task_that_is_killed_after_its_part_is_there_is_done(local, tmp_path, 
 
 def start_command(*arguments):
     """`cluster.run` in a process of its own, and of a group of its own, as a terminal starts it."""
-    code = "import pickle, sys\nfrom lala_jax import cluster\nlist(cluster.run(*pickle.load(sys.stdin.buffer)))"
+    code = "import pickle, signal, sys\nfrom lala_jax import cluster\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    code += "list(cluster.run(*pickle.load(sys.stdin.buffer)))"  # Ctrl-C is ignored where the tests run in the background
     how = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "start_new_session": True}
     command = subprocess.Popen([sys.executable, "-c", code], **how)
     pickle.dump(arguments, command.stdin)
@@ -146,7 +147,11 @@ def test_a_terminal_that_interrupts_lets_trainings_save(local, tmp_path):
     while not (tmp_path / "training").exists():
         time.sleep(0.05)
     os.killpg(command.pid, signal.SIGINT)
-    command.wait(60)
+    with command:
+        try:
+            command.wait(60)
+        finally:
+            command.kill()
     assert (tmp_path / "training.saved").exists() and ended(int((tmp_path / "training").read_text()))
 
 

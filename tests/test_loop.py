@@ -190,6 +190,7 @@ def test_a_second_command_on_a_work_directory_waits(module, function, first, tmp
         raise RuntimeError("far enough")
 
     monkeypatch.setattr(module, first, begin)
+    monkeypatch.setattr(train, "weights_to_start", lambda *_: None)
     monkeypatch.setattr(module.build, "recipe", lambda _: None)
     monkeypatch.setattr(module.build, "pretrain_recipe", lambda _: None)
     monkeypatch.setattr(module.build, "on_devices", lambda *_, **__: types.SimpleNamespace(mesh=None))

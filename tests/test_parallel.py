@@ -23,18 +23,18 @@ from lala_jax import build, checkpoint, loop, options, parallel, train
 
 ROOT = pathlib.Path(__file__).parent.parent
 ROUNDING = "pick_out/bias"  # what is added to all logits of a softmax: its gradient is zero but for rounding
-ALONE = ("JAX_", "SLURM_", "OMPI_", "KUBERNETES_", "JOB_COMPLETION_INDEX", "XLA_FLAGS")
+ALONE = ("JAX_", "SLURM_", "OMPI_", "KUBERNETES_", "JOB_COMPLETION_INDEX")
 
 
 def environment(**more):
-    """That of a process of its own, whatever this one runs in; the compilation cache stays."""
+    """That of a process of its own, whatever this one runs in; the compilation cache stays, and how programs are compiled."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith(ALONE) or "CACHE" in name}
     return {**kept, "JAX_PLATFORMS": "cpu", "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests")]), **more}
 
 
 def simulate(devices, *arguments):
     """Run the program on so many devices."""
-    flags = f"--xla_force_host_platform_device_count={devices}"
+    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={devices}"
     command = [sys.executable, str(ROOT / "tests" / "parallel_program.py"), *map(str, arguments)]
     done = subprocess.run(command, cwd=ROOT, env=environment(XLA_FLAGS=flags), capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-4000:]
