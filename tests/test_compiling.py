@@ -68,8 +68,8 @@ import jax, jax.numpy as jnp
 from lala_jax import compiling
 if sys.argv[1] == "keep":
     compiling.keep_memory()
-program = jax.jit(lambda x: jnp.sort(jnp.sort(x) * x).sum())
-x = jnp.ones(4_000_000)
+program = jax.jit(lambda x: ((x @ x.T) * ((x + 1) @ x.T)).sum())
+x = jnp.ones((2000, 100))
 def faults():
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
     program(x).block_until_ready()
