@@ -38,13 +38,22 @@ class Graph(nn.Module):
             count = len(nodes)
             ends = [jnp.broadcast_to(nodes[:, None], (count, count, nodes.shape[-1])), jnp.broadcast_to(nodes, (count, *nodes.shape))]
             pairs = self._mlp(jnp.concatenate([pairs, *ends], axis=-1), f"edges{index}")
-            nodes = self._mlp(jnp.concatenate([nodes, pairs.max(1), pairs.mean(1)], axis=-1), f"nodes{index}")
+            nodes = self._mlp(jnp.concatenate([nodes, largest(pairs, 1), pairs.mean(1)], axis=-1), f"nodes{index}")
         objects = len(state.size)
         return nn.Dense(1, kernel_init=nn.initializers.normal(1e-2), name="score")(pairs[:objects, objects:])[..., 0]
 
     def _mlp(self, x, name):
         x = convolution.relu(nn.Dense(self.width, name=f"{name}_in")(x))
         return nn.LayerNorm(name=f"{name}_norm")(nn.Dense(self.width, name=f"{name}_out")(x))
+
+
+def largest(x: jax.Array, axis: int) -> jax.Array:
+    """Give the largest along an axis, with the gradient to the first that is.
+
+    That of `jnp.max` goes to those that equal the result, divided by how many these are. Where XLA computes `x` once more for that, and
+    rounds it otherwise, there is none, and 0 / 0.
+    """
+    return jnp.take_along_axis(x, jnp.argmax(x, axis, keepdims=True), axis).squeeze(axis)
 
 
 def _nodes(state):

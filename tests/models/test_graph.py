@@ -84,3 +84,13 @@ def test_a_turn_that_looks_alike_changes_nothing(variables):
     turned = poses.at[:, 3].set(w * poses[:, 3] - z * poses[:, 6]).at[:, 6].set(w * poses[:, 6] + z * poses[:, 3])
     assert np.abs(turned - poses).max() > 0.1
     np.testing.assert_allclose(score(variables, STATE.replace(poses=turned)), score(variables, STATE), atol=1e-4)
+
+
+def test_the_largest_hands_its_gradient_to_one_entry():
+    """Also where several are as large: then to the first of them; of numbers that differ, all is as `jnp.max` has it."""
+    x, w = np.random.default_rng(0).normal(size=(3, 5, 4)).astype(np.float32), jnp.arange(12.0).reshape(3, 4)
+    found, expected = (jax.value_and_grad(lambda x, of=of: (of(x, 1) * w).sum())(x) for of in (graph.largest, jnp.max))
+    jax.tree.map(np.testing.assert_allclose, found, expected)
+    slopes = jax.grad(lambda x: (graph.largest(x, 1) * w).sum())(np.zeros_like(x))
+    np.testing.assert_array_equal(slopes[:, 0], w)
+    assert not slopes[:, 1:].any()
