@@ -37,7 +37,7 @@ ROWS = (
     Lever("default", "default"),
     Lever("default-again", "default, trained once more"),  # as far as the order of sums lets it differ: on one thread or two
     Lever("max-height", "max-height map instead of slices", ("model.max_height=true",)),
-    Lever("one-hot", "one-hot labels", ("model.multi_action=false",), revision=1),
+    Lever("one-hot", "one-hot labels", ("model.multi_action=false",), revision=2),
     Lever("matching", "no matching between the maps", ("model.matching=false",)),
     Lever("recolor", "no recolouring", ("augment.recolor=false",)),
     Lever("rigid", "no rigid motion", ("augment.rigid=false",)),

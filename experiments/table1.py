@@ -107,7 +107,7 @@ ROWS = (
         against=("two-stream",),
     ),
     Entry("ours-same-maps", "ours, from the pictures and maps of the paper's agents", family="same"),
-    Entry("ours-one-hot", "ours, one-hot labels", ("model.multi_action=false",), family="ours", revision=1, against=("ours",)),
+    Entry("ours-one-hot", "ours, one-hot labels", ("model.multi_action=false",), family="ours", revision=2, against=("ours",)),
     Entry("ours-no-matching", "ours, no matching between the maps", ("model.matching=false",), family="ours", against=("ours",)),
     Entry("blind", "blind: places well, ignores identities", family="computed", agent="blind"),
     Entry("top_view", "sees the goal from right above only, else perfect", family="computed", agent="top_view"),

@@ -49,12 +49,13 @@ class GoalAwarePolicy:
         return self.model.init(key, blank, blank, jnp.zeros(2, jnp.int32))["params"]
 
     def loss(self, params, key: jax.Array, state: types.State, current: types.TopDownMap, goal: types.TopDownMap):
-        """Give `(loss, metrics)` of one example; any object that is not yet placed may teach the place and the match."""
+        """Give `(loss, metrics)` of one example: what is not yet placed teaches, without `multi_action` only the object that is drawn."""
         key_draw, key_match, key_refine = jax.random.split(key, 3)
         state = jax.tree.map(jnp.asarray, state)
         variables, model, spec = {"params": params}, self.model, self.spec
         candidates = state.ready if not self.multi_action else ~state.placed
         sample = policy.draw(key_draw, state, spec=spec, rotations=model.rotations, candidates=candidates, multi_action=self.multi_action)
+        teaches = candidates if self.multi_action else candidates & (jnp.arange(len(candidates)) == sample.index)
         match, layout = self._look(variables, current, goal)
         target = model.apply(variables, match, sample.pick, method="target")
         place = self._place(variables, layout, target, sample.pick)
@@ -64,9 +65,9 @@ class GoalAwarePolicy:
         }
         more = {}
         if self._matches:
-            terms["match"], terms["next"], more["match_right"] = self._match_losses(key_match, state, match)
+            terms["match"], terms["next"], more["match_right"] = self._match_losses(key_match, state, match, teaches)
         if self.refine:
-            terms["refine"], terms["fit"], refined = self._refine_losses(variables, key_refine, state, match, layout)
+            terms["refine"], terms["fit"], refined = self._refine_losses(variables, key_refine, state, match, layout, teaches)
             more |= refined
         total = terms["pick"] + terms["place"] + self.match_weight * (terms.get("match", 0.0) + terms.get("next", 0.0))
         total += self.refine_weight * (terms.get("refine", 0.0) + terms.get("fit", 0.0))
@@ -82,8 +83,8 @@ class GoalAwarePolicy:
     def _place(self, variables, layout, target, pick) -> jax.Array:
         return jnp.asarray(self.model.apply(variables, layout, target, pick, method="place"))
 
-    def _match_losses(self, key, state, match):
-        """Match every unplaced object with its voxels in the goal, and tell the voxels that may be built next."""
+    def _match_losses(self, key, state, match, teaches):
+        """Match every object that `teaches` `[N]` with its voxels in the goal, and tell the voxels that may be built next."""
         spec, token = self.spec, match.token
         xy = types.world_from_cell(spec, (token[:, :2] + 0.5) * goal_aware.POOL)
         z = spec.z[0] + (token[:, 2:] + 0.5) * spec.slice_height
@@ -98,20 +99,20 @@ class GoalAwarePolicy:
             picked = match.current[flat // spec.cols // goal_aware.POOL, flat % spec.cols // goal_aware.POOL]
             scores = jnp.where(match.token_valid, match.token_embedding @ picked, -1e9)
             own = whose == index
-            use = valid.any() & own.any() & ~state.placed[index]
+            use = valid.any() & own.any() & teaches[index]
             return use, losses.masked_cross_entropy(scores, own), own[scores.argmax()]
 
         use, loss, right = jax.vmap(one)(keys, jnp.arange(cells.shape[0]), cells)
         total = jnp.maximum(use.sum(), 1)
-        upcoming = (whose >= 0) & state.ready[whose]
+        upcoming = (whose >= 0) & (state.ready & teaches)[whose]
         return (
             (use * loss).sum() / total,
             losses.masked_cross_entropy(match.token_next, upcoming),
             jnp.where(use.any(), (use * right).sum() / total, jnp.nan),
         )
 
-    def _refine_losses(self, variables, key, state, match, layout):
-        """Hold every unplaced object over its goal as it fits and a quarter turned, a little off: which fits, and how far off are they?"""
+    def _refine_losses(self, variables, key, state, match, layout, teaches):
+        """Hold every object that `teaches` `[N]` over its goal as it fits and a quarter turned, a little off: which fits, by how much?"""
         model, spec = self.model, self.spec
         bins = model.rotations / (2 * math.pi)
         cells = losses.pick_valid(state, spec=spec)
@@ -132,7 +133,7 @@ class GoalAwarePolicy:
             target = model.apply(variables, match, pick, method="target")
             offset, fit = self._refine(variables, layout, target, pick, start, label.yaw * bins + turn_error)
             wanted = jnp.concatenate([types.cell_from_world(spec, label.xy) - (start + 0.5), -turn_error[:, None]], axis=-1)
-            use = valid.any() & ~state.placed[index]
+            use = valid.any() & teaches[index]
             misfit = jnp.where(label.valid, 0.0, jnp.abs(state.size[index, 0] - state.size[index, 1])) / goal_aware.MISFIT
             fit_loss = losses.masked_cross_entropy(FIT_SCALE * fit, label.valid) + losses.huber(fit + misfit).mean() / 2
             error = jnp.linalg.norm(offset[:, :2] - wanted[:, :2], axis=-1).mean() * spec.cell

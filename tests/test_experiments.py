@@ -370,7 +370,7 @@ def test_the_ablation_trains_each_row_once(trains, monkeypatch, tmp_path, capsys
     given = ["--task=tower", "--steps=5", "--episodes=4", "--seed=2", f"--workdir={tmp_path / 'runs' / '<task>'}", f"--out={tmp_path}"]
     rows = ablation.command([*given, "--rows=one-hot,average-turns"])
     runs = tmp_path / "runs" / "tower"
-    assert [name for name, _ in trains] == [str(runs / "default"), str(runs / "one-hot-r1")]
+    assert [name for name, _ in trains] == [str(runs / "default"), str(runs / "one-hot-r2")]
     assert loaded == [str(runs / "default" / "checkpoints")] and checked == [(loaded[0], 5)]
     for _, config in trains:
         assert (config.train.steps, config.train.eval_every, config.seed, config.data.demos) == (5, 5, 2, 500)

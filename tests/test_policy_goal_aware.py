@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from test_policy import GOAL_AWARE, POLICIES, ROTATIONS, SPEC, batch_of, batched_loss, check_action, example, state_of
+from test_policy import GOAL_AWARE, POLICIES, ROTATIONS, SPEC, batch_of, batched_loss, check_action, example, map_of, state_of
 from test_policy_graph import GRAPH
 
 from lala_jax import policy, policy_goal_aware, types
@@ -256,7 +256,7 @@ def test_tokens_are_told_whose_they_are_where_they_lie(yaw):
     )  # fmt: skip
 
     def loss(scores):
-        return POLICIES["goal_aware"]._match_losses(jax.random.key(0), state, match.replace(token_next=scores))[1]
+        return POLICIES["goal_aware"]._match_losses(jax.random.key(0), state, match.replace(token_next=scores), ~state.placed)[1]
 
     told = np.asarray(jax.grad(loss)(match.token_next)) < 0
     x = SPEC.x[0] + (grid[:, 1] + 0.5) * pool * SPEC.cell - goal[0, 0]
@@ -271,6 +271,35 @@ def test_tokens_are_told_whose_they_are_where_they_lie(yaw):
 def means(metrics):
     """The mean of every metric over some steps."""
     return {name: float(np.mean([one[name] for one in metrics])) for name in metrics[0]}
+
+
+def test_one_hot_labels_tell_of_the_drawn_object_only():
+    """Two objects may go next: where the other one belongs matters to every loss with labels of every right action, else to none."""
+    state = state_of(0)
+    beside = state.goal[0].at[1].add(-0.15 * jnp.sign(state.goal[0, 1]))
+    state = state.replace(goal=state.goal.at[1].set(beside), ready=jnp.ones(2, bool))
+    now, goal = map_of(state, state.poses), map_of(state, state.goal)
+    elsewhere = state.replace(goal=state.goal.at[1, 0].add(0.02))
+    keys = jax.random.split(jax.random.key(5), 6)
+    names = ("loss_pick", "loss_place", "loss_match", "loss_next", "loss_refine", "loss_fit")
+    for multi_action in (False, True):
+        agent = policy_goal_aware.GoalAwarePolicy(model=GOAL_AWARE, multi_action=multi_action)
+        params, loss = compiled("goal_aware")[0], jax.jit(agent.loss)
+        drawn = []
+        for key in keys:
+            sample = policy.draw(
+                jax.random.split(key, 3)[0], state, spec=SPEC, rotations=ROTATIONS, candidates=state.ready, multi_action=multi_action
+            )
+            drawn.append(int(sample.index))
+            metrics, other = (loss(params, key, each, now, goal)[1] for each in (state, elsewhere))
+            same = {name: bool(metrics[name] == other[name]) for name in names}
+            if drawn[-1] == 0 and not multi_action:
+                assert all(same.values()), same
+            elif drawn[-1] == 0:
+                assert not any(same[name] for name in ("loss_match", "loss_next", "loss_refine")), same
+            else:
+                assert not any(same[name] for name in ("loss_place", "loss_match", "loss_next", "loss_refine")), same
+        assert set(drawn) == {0, 1}
 
 
 def test_goal_aware_learns_a_batch_by_heart():
