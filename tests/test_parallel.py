@@ -105,7 +105,8 @@ def test_eight_devices_learn_what_one_does(eight, kept):
     assert_same(stored(eight, kept), alone(), rtol=1e-4)
 
 
-@pytest.mark.parametrize("number", [2, pytest.param(8, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [2, 8])
 def test_the_default_agent_learns_the_same(tmp_path, number):
     simulate(number, "agents", tmp_path, number)
     assert_same(stored(tmp_path, "agent"), program.advance(program.agent(number)), rtol=1e-4)
