@@ -331,8 +331,7 @@ def first_step(config, *, cached: bool) -> timing.Work:
     def run():
         done = subprocess.run(command, input=request, env={**os.environ, **keep}, capture_output=True, text=True, check=False)
         if done.returncode:
-            last = (done.stderr.strip().splitlines() or [""])[-1]
-            raise timing.Unavailable(f"a first training step ended with status {done.returncode}: {last[:300]}", failed=True)
+            raise timing.Unavailable(f"a first training step {timing.ended(done)}", failed=True)
 
     if cached:
         run()

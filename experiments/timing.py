@@ -162,12 +162,17 @@ def alone(name: str, stage: Stage, config, repeats: int) -> dict[str, Any]:
     except subprocess.TimeoutExpired:
         raise Unavailable(f"not done after {LIMIT:.0f} s", failed=True) from None
     if done.returncode:
-        last = (done.stderr.strip().splitlines() or [""])[-1]
-        raise Unavailable(f"ended with status {done.returncode}: {last[:300]}", failed=True)
+        raise Unavailable(ended(done), failed=True)
     row = json.loads(done.stdout.splitlines()[-1])
     if "unavailable" in row:
         raise Unavailable(row["unavailable"], failed=row.get("failed", False))
     return row
+
+
+def ended(done: subprocess.CompletedProcess[str]) -> str:
+    """Say with which status a process ended, and the last line of its errors."""
+    last = (done.stderr.strip().splitlines() or [""])[-1]
+    return f"ended with status {done.returncode}: {last[:300]}"
 
 
 def serve(stages: Mapping[str, Stage]) -> None:

@@ -81,8 +81,12 @@ def describe(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 def fingerprint(path: str | os.PathLike[str], params: Any) -> dict[str, Any]:
     """Say what identifies the weights of a checkpoint: the step, and a checksum of all leaves."""
-    content = b"".join(np.asarray(leaf).tobytes() for _, leaf in sorted(checkpoint.named(params).items()))
-    return {"step": describe(path)["step"], "crc32": zlib.crc32(content)}
+    return {"step": describe(path)["step"], "crc32": checksum(params)}
+
+
+def checksum(tree: Any) -> int:
+    """Give one CRC-32 of the bytes of all leaves, in the order of their names."""
+    return zlib.crc32(b"".join(np.asarray(leaf).tobytes() for _, leaf in sorted(checkpoint.named(tree).items())))
 
 
 def card(path: str | os.PathLike[str]) -> dict[str, Any] | None:
