@@ -13,6 +13,8 @@ from lala_jax import types
 from lala_jax.perception import batches, image
 from lala_jax.perception import camera as cameras
 
+SKIN = 0.005  # metres under a cell's highest point that still count as its top face
+
 
 def fuse(
     points: Float[Array, "p 3"],
@@ -22,7 +24,7 @@ def fuse(
     spec: types.MapSpec,
     floor_margin: float = 0.01,
     surface_margin: float = 0.001,
-    skin: float = 0.005,
+    skin: float = SKIN,
 ) -> types.TopDownMap:
     """Average the features and the place of the points in each voxel, and keep each cell's highest point.
 
@@ -35,23 +37,29 @@ def fuse(
     where rounding would deal its points to two slices. Heights are not touched by it.
     The result does not depend on the order of points, up to float32 rounding of the sums.
     """
-    voxel, cell, height = _locate(points, valid, spec, floor_margin, surface_margin)
-    at = types.cell_from_world(spec, points[:, :2])
-    within = at - jnp.floor(at) - 0.5
-    rows = jnp.concatenate([features.astype(jnp.float32), within, jnp.ones((len(features), 1))], axis=-1)
-    total = jnp.zeros((spec.rows * spec.cols * spec.slices, rows.shape[1])).at[voxel].add(rows, **_DROP)
-    top = jnp.zeros(spec.rows * spec.cols, points.dtype).at[cell].max(height, **_DROP)
-    high = jnp.where(height > top.at[cell].get(mode="fill", fill_value=jnp.inf) - skin, cell, spec.rows * spec.cols)
-    face = jnp.concatenate([within, jnp.ones_like(within[:, :1])], axis=-1)
-    face = jnp.zeros((spec.rows * spec.cols, 3)).at[high].add(face, **_DROP)
-    count = total[:, -1:]
-    mean = (total[:, :-1] / jnp.maximum(count, 1)).reshape(spec.rows, spec.cols, spec.slices, -1)
+    return _fuse(_in_cells(spec, points), features, valid, spec, skin, floor_margin, surface_margin)
+
+
+def _fuse(at, features, valid, spec, skin, *margins):
+    """Fuse points whose places are given by `_in_cells`.
+
+    The features are added as they are, and the places apart from them: to write both side by side first costs more than all additions.
+    """
+    cells, shape = spec.rows * spec.cols, (spec.rows, spec.cols, spec.slices)
+    voxel, cell, within = _locate(at, valid, spec, *margins)
+    place = jnp.concatenate([within, jnp.ones_like(within[:, :1])], axis=-1)
+    total = jnp.zeros((cells * spec.slices, features.shape[1])).at[voxel].add(features.astype(jnp.float32), **_DROP)
+    placed = jnp.zeros((cells * spec.slices, 3)).at[voxel].add(place, **_DROP)
+    top = jnp.zeros(cells, at.dtype).at[cell].max(at[:, 2], **_DROP)
+    high = jnp.where(at[:, 2] > top.at[cell].get(mode="fill", fill_value=jnp.inf) - skin, cell, cells)
+    face = jnp.zeros((cells, 3)).at[high].add(place, **_DROP)
+    points = jnp.maximum(placed[:, 2:], 1)
     return types.TopDownMap(
-        features=mean[..., :-2],
-        count=count.reshape(mean.shape[:3]),
-        offset=mean[..., -2:],
-        height=top.reshape(mean.shape[:2]),
-        skin=(face[:, :2] / jnp.maximum(face[:, 2:], 1)).reshape(*mean.shape[:2], 2),
+        features=(total / points).reshape(*shape, -1),
+        count=placed[:, 2].reshape(shape),
+        offset=(placed[:, :2] / points).reshape(*shape, 2),
+        height=top.reshape(shape[:2]),
+        skin=(face[:, :2] / jnp.maximum(face[:, 2:], 1)).reshape(*shape[:2], 2),
     )
 
 
@@ -59,16 +67,23 @@ def fuse(
 _DROP = {"mode": "drop", "wrap_negative_indices": False}
 
 
-def _locate(points, valid, spec, floor_margin, surface_margin):
-    """Give each point's flat voxel index, flat cell index (both past the end if the point is dropped) and height."""
-    index = types.index_from_world(spec, points[:, :2])
-    row, col = index[:, 0], index[:, 1]
-    height = points[:, 2] - spec.z[0]
+def _in_cells(spec, points):
+    """Give points `[..., 3]` as continuous `(row, col)` and metres above the map's floor.
+
+    As one array, which XLA stores on a CPU; of three it would compute each again wherever it is read.
+    """
+    return jnp.concatenate([types.cell_from_world(spec, points[..., :2]), points[..., 2:] - spec.z[0]], axis=-1)
+
+
+def _locate(at, valid, spec, floor_margin, surface_margin):
+    """Give each point's flat voxel index, flat cell index (both past the end if the point is dropped) and place within the cell."""
+    low = jnp.floor(at[:, :2])
+    row, col, height = low[:, 0].astype(jnp.int32), low[:, 1].astype(jnp.int32), at[:, 2]
     keep = valid & (row >= 0) & (row < spec.rows) & (col >= 0) & (col < spec.cols)
     keep &= (height >= -floor_margin) & (height < spec.z[1] - spec.z[0])
     layer = jnp.clip(jnp.floor((height - surface_margin) / spec.slice_height).astype(jnp.int32), 0, spec.slices - 1)
-    cell = jnp.where(keep, row * spec.cols + col, spec.rows * spec.cols)
-    return jnp.where(keep, cell * spec.slices + layer, spec.rows * spec.cols * spec.slices), cell, height
+    voxel = jnp.where(keep, (row * spec.cols + col) * spec.slices + layer, spec.rows * spec.cols * spec.slices)
+    return voxel, voxel // spec.slices, at[:, :2] - low - 0.5
 
 
 def from_views(
@@ -89,16 +104,10 @@ def from_views(
     cameras.check_floating("views.rgb", views.rgb, "in 0..1")
     cameras.check_floating("views.depth", views.depth, "metres")
     _check_shapes(views)
-    points = jax.vmap(cameras.unproject)(views.depth, views.camera)
+    at = _in_cells(spec, jax.vmap(cameras.unproject)(views.depth, views.camera))
     values = views.rgb if features is None else jnp.concatenate([views.rgb, features], axis=-1)
-    return fuse(
-        points.reshape(-1, 3),
-        values.reshape(-1, values.shape[-1]),
-        (views.depth > 0).reshape(-1),
-        spec=spec,
-        floor_margin=floor_margin,
-        surface_margin=surface_margin,
-    )
+    values, valid = values.reshape(-1, values.shape[-1]), (views.depth > 0).reshape(-1)
+    return _fuse(at.reshape(-1, 3), values, valid, spec, SKIN, floor_margin, surface_margin)
 
 
 def _check_shapes(views: types.Views) -> None:
@@ -149,8 +158,9 @@ def surface_features(
 
     def one(view):
         depth, camera, grid = view
-        points = cameras.unproject(depth, camera).reshape(-1, 3)
-        _, cell, height = _locate(points, (depth > 0).ravel(), spec, floor_margin, surface_margin)
+        at = _in_cells(spec, cameras.unproject(depth, camera)).reshape(-1, 3)
+        height = at[:, 2]
+        _, cell, _ = _locate(at, (depth > 0).ravel(), spec, floor_margin, surface_margin)
         top = jnp.full(spec.rows * spec.cols, -jnp.inf).at[cell].max(height, **_DROP)
         highest = height >= top.at[cell].get(mode="fill", fill_value=jnp.inf)
         pixel = jnp.full(spec.rows * spec.cols, -1).at[jnp.where(highest, cell, spec.rows * spec.cols)].max(jnp.arange(len(cell)), **_DROP)
