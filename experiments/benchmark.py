@@ -6,8 +6,8 @@ Writes `<device>-<task>.json` to `--out` and prints its tables; until all is tim
 `--stages=render,fuse` times only these (and the two ceilings); as ratios are of one run, it is refused where it would replace a file
 that holds other stages, too.
 `--against=FILE` compares with an earlier file by ratios of medians, and ends with status 1 where a stage takes more than `--limit`
-times as long or fails. Comparisons that need what is not installed (PyTorch: extra `benchmark`; OpenGL: Debian's libegl1 and
-libgl1-mesa-dri) are left out, and the table says so.
+times as long or fails; with `--timed=FILE` it is that file that is compared, and nothing is timed. Comparisons that need what is not
+installed (PyTorch: extra `benchmark`; OpenGL: Debian's libegl1 and libgl1-mesa-dri) are left out, and the table says so.
 """
 
 from __future__ import annotations
@@ -33,12 +33,15 @@ FLAGS = {
     "growth": False,
     "repeats": 5,
     "against": "",
+    "timed": "",
     "limit": 1.3,
     "out": "experiments/results/benchmark",
 }
 
 
-def main(config, workdir, *, task: str, stages: str, growth: bool, repeats: int, against: str, limit: float, out: str) -> dict[str, Any]:
+def main(
+    config, workdir, *, task: str, stages: str, growth: bool, repeats: int, against: str, timed: str, limit: float, out: str
+) -> dict[str, Any]:
     """Time the stages of a task, and compare them with an earlier run's."""
     del workdir
     common.check_task(config, task)
@@ -49,6 +52,14 @@ def main(config, workdir, *, task: str, stages: str, growth: bool, repeats: int,
     known = [name for name in every if name not in ceilings]
     wanted = [options.check_choice("--stages", name, known) for name in stages.split(",") if name] or known
     before, here = read(against) if against else None, machine()
+    if timed:
+        if before is None:
+            raise options.OptionsError(f"--timed={timed} is compared with --against=FILE, which is not given")
+        result = read(timed, "--timed")
+        check_comparable(before, result, wanted, now="--timed holds")
+        if slower(before, only(result, wanted), limit):
+            raise SystemExit(1)
+        return result
     if before is not None:
         check_comparable(before, {"task": task, **here}, wanted)
     kind = "".join(letter if letter.isalnum() else "-" for letter in here["device"].lower())
@@ -161,20 +172,31 @@ def read(path: str, flag: str = "--against") -> dict[str, Any]:
         raise options.OptionsError(f"{flag}={path} is no file of this benchmark: {type(error).__name__} {error}") from error
 
 
-def check_comparable(before: Mapping[str, Any], now: Mapping[str, Any], names: Sequence[str]) -> None:
+def check_comparable(before: Mapping[str, Any], after: Mapping[str, Any], names: Sequence[str], *, now: str = "this is") -> None:
     """Raise OptionsError where an earlier file is of another task or machine, or has no time of any stage in `names`.
 
     An older file does not name its processor, and is compared with a warning.
     """
-    there, here = (f"{one['task']} on {one['device']}, {one['processors']} processors" for one in (before, now))
-    if "processor" not in before:
-        print("--against does not name its processor: the ratios are of this code only where it ran on this machine", flush=True)
-    if there == here and before.get("processor", now["processor"]) != now["processor"]:
-        there, here = before["processor"], now["processor"]
+    there, here = (f"{one['task']} on {one['device']}, {one['processors']} processors" for one in (before, after))
+    if unnamed := [flag for flag, one in (("--against", before), ("--timed", after)) if "processor" not in one]:
+        print(f"{' and '.join(unnamed)} without the name of a processor: are both of one machine? Else ratios say nothing", flush=True)
+    elif there == here and before["processor"] != after["processor"]:
+        there, here = before["processor"], after["processor"]
     if there != here:
-        raise options.OptionsError(f"--against holds {there}, this is {here}: their ratio says nothing")
+        raise options.OptionsError(f"--against holds {there}, {now} {here}: their ratio says nothing")
     if not {row["name"] for row in before["stages"] if "seconds" in row} & set(names):
         raise options.OptionsError(f"--against holds times of none of the stages {', '.join(names)}")
+
+
+def only(result: Mapping[str, Any], names: Sequence[str]) -> dict[str, Any]:
+    """Keep some of the stages, and the ceilings."""
+    return {**result, "stages": [row for row in result["stages"] if row["name"] in (*benchmark_stages.CEILINGS, *names)]}
+
+
+def medians(result: Mapping[str, Any]) -> dict[str, float]:
+    """Give the median of each stage that was timed, and of each size of what grows."""
+    grown = [{**row, "name": f"{one['name']} {row['value']}"} for one in result.get("growth", ()) for row in one["rows"]]
+    return {row["name"]: row["seconds"] for row in (*result["stages"], *grown) if "seconds" in row}
 
 
 def slower(before: Mapping[str, Any], after: Mapping[str, Any], limit: float) -> list[str]:
@@ -182,9 +204,9 @@ def slower(before: Mapping[str, Any], after: Mapping[str, Any], limit: float) ->
 
     The ceilings are printed, too, but judged not: no code of ours changes them.
     """
-    old = {row["name"]: row["seconds"] for row in before["stages"] if "seconds" in row}
+    old = medians(before)
     lost = {row["name"]: row["unavailable"] for row in after["stages"] if row.get("failed") and row["name"] in old}
-    ratios = {row["name"]: row["seconds"] / old[row["name"]] for row in after["stages"] if "seconds" in row and row["name"] in old}
+    ratios = {name: seconds / old[name] for name, seconds in medians(after).items() if name in old}
     print(common.table(["stage", "time, ratio"], [[name, f"{ratio:.2f}"] for name, ratio in ratios.items()]))
     found = [name for name, ratio in ratios.items() if ratio > limit and name not in benchmark_stages.CEILINGS]
     if found:

@@ -304,7 +304,7 @@ def save(config) -> timing.Work:
     folder, steps = tempfile.TemporaryDirectory(), itertools.count(1)
     store = checkpoint.Checkpoints(folder.name)
 
-    return timing.Work(lambda: store.save_latest(next(steps), fresh, **stored), close=folder.cleanup)
+    return timing.Work(lambda: store.save_latest(next(steps), fresh, **stored), facts=size_of(fresh), close=folder.cleanup)
 
 
 def restore(config) -> timing.Work:
@@ -313,7 +313,12 @@ def restore(config) -> timing.Work:
     folder = tempfile.TemporaryDirectory()
     store = checkpoint.Checkpoints(folder.name)
     store.save_latest(1, fresh, **stored)
-    return timing.Work(lambda: store.restore_latest(fresh), close=folder.cleanup)
+    return timing.Work(lambda: store.restore_latest(fresh), facts=size_of(fresh), close=folder.cleanup)
+
+
+def size_of(tree) -> dict[str, float]:
+    """Count the bytes of all leaves."""
+    return {"bytes": float(sum(leaf.nbytes for leaf in jax.tree.leaves(tree)))}
 
 
 def start_up(config) -> timing.Work:

@@ -58,10 +58,10 @@ TARGETS = (
     gpu("paper's step in bfloat16, a sample", 0.01, "s", LARGE, seconds),
     gpu("20,000 samples of it", 240, "s", LARGE, functools.partial(seconds, of=20_000)),
     gpu(
-        "its network's rate over a matrix product's",
+        "its rate over a matrix product's",
         0.35,
         "%",
-        ("train-paper-network-bfloat16", "matmul-bfloat16"),
+        (*LARGE, "matmul-bfloat16"),
         functools.partial(ratio, field="flops_per_second"),
         at_least=True,
     ),

@@ -134,17 +134,21 @@ def timed(name: str, stages: Mapping[str, Stage], config, repeats: int, *, apart
             raise Unavailable(f"needs a {stage.platform.upper()}")
         if stage.alone or apart:
             return row | alone(name, stage, config, repeats)
-        return row | measured(stage.prepare(config), repeats) | device_memory()
+        before = device_memory()
+        return row | measured(stage.prepare(config), repeats) | device_memory(before)
     except Unavailable as error:
         return {**row, "unavailable": str(error), **({"failed": True} if error.failed else {})}
     except jax.errors.JaxRuntimeError as error:  # such as memory that a device does not have: the other stages count
         return {**row, "unavailable": str(error).partition("\n")[0][:300], "failed": True}
 
 
-def device_memory() -> dict[str, float]:
-    """Give the most bytes that this process has had on the device so far, where the device counts them."""
-    stats = jax.devices()[0].memory_stats() or {}
-    return {"device_memory_peak": float(stats["peak_bytes_in_use"])} if "peak_bytes_in_use" in stats else {}
+def device_memory(before: Mapping[str, float] | None = None) -> dict[str, float]:
+    """Give the most bytes that this process has had on the device so far, where the device counts them.
+
+    Gives nothing where that is no more than it was `before`: the peak is that of an earlier stage.
+    """
+    peak = float((jax.devices()[0].memory_stats() or {}).get("peak_bytes_in_use", 0))
+    return {"device_memory_peak": peak} if peak > (before or {}).get("device_memory_peak", 0) else {}
 
 
 # A process of its own

@@ -45,10 +45,10 @@ def jit_step(function: Callable[..., Any], *, state: int = 0, **how: Any):
 def build(jitted, *arguments: Any) -> tuple[Any, dict[str, float]]:
     """Compile a jitted function for its arguments, static ones among them, without running it.
 
-    Gives the program, which takes those that are not static, and facts: `compile_seconds`, the `flops` of a run (see `flops`), as far as
-    XLA counts them the `bytes` that it moves (not where there is a loop, whose body it counts once), and the `memory` in bytes that it
-    needs: arguments, results (those in donated memory once) and what is between. On a CPU a program that needs more than LARGE is
-    compiled once more, LEAN, and the memory that compiling has left is given back.
+    Gives the program, which takes those that are not static, and facts: `compile_seconds`, the `flops` of a run (see `flops`), the
+    `bytes` that it moves as XLA counts them (of a program with a loop, whose body XLA counts once, the least that it moves: arguments and
+    results), and the `memory` in bytes that it needs: arguments, results (those in donated memory once) and what is between. On a CPU a
+    program that needs more than LARGE is compiled once more, LEAN, and the memory that compiling has left is given back.
     """
     begin = time.perf_counter()
     traced = jitted.trace(*arguments)
@@ -58,7 +58,8 @@ def build(jitted, *arguments: Any) -> tuple[Any, dict[str, float]]:
         program = lowered.compile(LEAN)
         _glibc("malloc_trim", 0)
     facts = {"compile_seconds": time.perf_counter() - begin}
-    moved = 0 if _loops(traced.jaxpr) else (program.cost_analysis() or {}).get("bytes accessed", 0)
+    plan = program.memory_analysis() if _loops(traced.jaxpr) else None
+    moved = plan.argument_size_in_bytes + plan.output_size_in_bytes if plan else (program.cost_analysis() or {}).get("bytes accessed", 0)
     counts = {"flops": flops(traced.jaxpr), "bytes": moved, "memory": memory_of(program)}
     return program, facts | {name: float(count) for name, count in counts.items() if count > 0}
 

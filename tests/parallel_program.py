@@ -91,14 +91,18 @@ def devices(directory):
     assert specs(run) == specs(start(split))
     assert specs(run.params) == {"in": PartitionSpec(None, "data"), "out": PartitionSpec("data"), "odd": PartitionSpec()}
     assert specs(run.average) == specs(run.params) and run.params["in"].addressable_data(0).shape == (16, 3)
-    checkpoint.Checkpoints(directory).save_latest(3, run, **STORED)
-    for number, shard in ((2, True), (2, False), (8, False)):
+    source = checkpoint.Checkpoints(directory)
+    source.save_latest(3, run, **STORED)
+    for number, shard in ((2, False), (8, False), (2, True), (8, True)):  # the last time from what lies on two
         few = Mesh(np.array(jax.devices()[:number]), ("data",))
-        again = loop.start_or_resume(start(probe()), checkpoint.Checkpoints(directory), CONFIG, dict, mesh=few, shard=shard)
+        again = loop.start_or_resume(start(probe()), source, CONFIG, dict, mesh=few, shard=shard)
         assert specs(again) == {
             name: sharding.spec for name, sharding in checkpoint.named(parallel.shardings(few, run, shard=shard)).items()
         }
         assert test_train_step.bits(again) == test_train_step.bits(run)
+        if (number, shard) == (2, True):
+            source = checkpoint.Checkpoints(directory / "on_two")
+            source.save_latest(3, again, **STORED)
     try:
         parallel.mesh("train.batch_size", 12)
     except options.OptionsError as error:
