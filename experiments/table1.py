@@ -6,7 +6,7 @@ besides, `pretrain_samples` and `pretrain_seconds` where its backbone was pre-tr
 `config` says), `<scale>.md`, a table of both tasks as far as they are there and one of what the rows differ by, and `<scale>.webp`, the
 scores as bars, to `--out`. The scales are
 `smoke` (every part, scores that mean nothing), `cpu` (all from the default agent's pictures and maps, half the paper's in each direction,
-by networks of about as many parameters as ours, pretrained features to the stem only: a row trains in a quarter of an hour to one) and
+by networks of about as many parameters as ours, pretrained features to the stem only: most rows train in a third of an hour to one) and
 `paper` (the paper's own sizes and number of samples, in bfloat16; for a GPU).
 Runs lie in `--workdir`, runs/table1/<task> unless told, each in <scale>-<row>. Started again, it goes on with the rows that are
 missing, and within a row where its training stopped; `--rows=two-stream,ours` runs only these. The row `cliport-clip` needs CLIP's own

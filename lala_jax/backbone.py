@@ -3,8 +3,8 @@
     lala_jax/features/<name>.npz   weights that ship, named as in their source; their SHA-256 is in PACKAGED
     lala_jax/features/README.md    where they come from, their licence, what their storage costs
 
-A file's names say what it is: torchvision's `resnet50` state dict (`.safetensors` or `.npz`), or Keras Applications' `ResNet50`
-(`.npz`, say from `np.savez(file, **{w.path: w.numpy() for w in model.weights})`), with the layer names of today or of before 2019.
+A file, `.safetensors` or `.npz`, says by its names what it is: torchvision's `resnet50` state dict, or Keras Applications' `ResNet50`
+(say from `np.savez(file, **{w.path: w.numpy() for w in model.weights})`), with the layer names of today or of before 2019.
 """
 
 from __future__ import annotations

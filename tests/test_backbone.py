@@ -142,7 +142,8 @@ def test_half_precision_is_read_exactly(state, tmp_path, dtype):
     same(layer(variables, "stem"), [kernel.transpose(2, 3, 1, 0), *vectors])
 
 
-def test_kerass_names_of_today(tmp_path):
+@pytest.mark.parametrize("suffix", [".npz", ".safetensors"])
+def test_kerass_names_of_today(tmp_path, suffix):
     def today(name):
         path, leaf = name.split("/")
         if "conv1" in path:
@@ -152,7 +153,8 @@ def test_kerass_names_of_today(tmp_path):
         return f"conv{stage}_block{'abcd'.index(block) + 1}_{number}_{'conv' if kind == 'res' else 'bn'}/{leaf}"
 
     tensors = {today(name): tensor for name, tensor in packaged().items()} | {"predictions/bias": np.zeros(1000, np.float32)}
-    module, variables = backbone.load(written(tmp_path / "mine.npz", npz(**tensors)), stage="conv3")
+    content = safetensors(tensors) if suffix == ".safetensors" else npz(**tensors)
+    module, variables = backbone.load(written(tmp_path / f"mine{suffix}", content), stage="conv3")
     assert module.flavour == resnet.KERAS and bits(variables) == bits(backbone.load(NAME, stage="conv3")[1])
 
 

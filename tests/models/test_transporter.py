@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import reference
 
-from lala_jax.models import transporter
+from lala_jax.models import streams, transporter
 
 SMALL = {"yaw_bins": 4, "crop": 8, "width": 8, "stages": 2}
 
@@ -73,6 +73,35 @@ def test_rivals_have_the_public_parameters(variant, goal_nets, public, biases):
     logits, intermediates = jax.eval_shape(net.apply, params, image, image, cell, image)
     assert logits["pick"].shape == (320, 160) and logits["place"].shape == (36, 320, 160)
     assert intermediates["key"].shape == (384, 224, 3) and intermediates["query"].shape == (36, 64, 64, 3)
+
+
+def _streams(params, variant, current, goal):
+    """The paper's three ways to take both images in, in NumPy, on the parameters of one network."""
+    if variant == "single":
+        return reference.hourglass(params["difference"], current - goal, 2)
+    decoded = []
+    first = reference.hourglass(params["current"], current, 2, decoded=decoded)
+    second = reference.hourglass(params["goal"], goal, 2, laterals=decoded if variant == "two_stream_lateral" else None)
+    return reference.conv(np.concatenate([first, second], -1), params["fuse"]) if "fuse" in params else first + second
+
+
+@pytest.mark.parametrize("variant", streams.VARIANTS)
+def test_the_papers_agents_equal_their_formulas_in_numpy(variant):
+    """From the maps to both logits on the same random weights: the query's goal is cropped at the pick, as the paper has it."""
+    net = transporter.Transporter(variant, **(SMALL | {"width": 4}))
+    maps, cell = np.asarray(_maps()), (8, 2)
+    params = _drawn(net, *maps, np.array(cell))
+    logits, intermediates = jax.jit(net.apply)(params, *maps, jnp.array(cell))
+    square = [np.pad(one, ((0, 0), (2, 2), (0, 0))) for one in maps]
+    wide = [np.pad(one, ((4, 4), (4, 4), (0, 0))) for one in maps]
+    crops = [reference.quarter_crops(one, cell, 8) for one in maps]
+    pick, key, query = (
+        _streams(params["params"][f"{name}_net"], variant, *both) for name, both in (("pick", square), ("key", wide), ("query", crops))
+    )
+    for found, wanted in ((logits["pick"], pick[:, 2:-2, 0]), (intermediates["key"], key), (intermediates["query"], query)):
+        np.testing.assert_allclose(found, wanted, atol=1e-4)
+    place = reference.places(key, query) / 8 / 3**0.5
+    np.testing.assert_allclose(logits["place"], place, atol=1e-3 * place.std())
 
 
 @pytest.mark.parametrize("variant", ["transporter", "image_goal", "goal_split"])
