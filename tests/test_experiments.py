@@ -545,7 +545,8 @@ def uncached():
     jax.clear_caches()
 
 
-ALWAYS = ("ours", "single", "graph", "blind", "top_view", "oracle")  # a row of each kind; the others compile for minutes
+# A row of each kind; the others compile for minutes.
+ALWAYS = ("ours", "single", "transporter", "two-stream-scene", "graph", "blind", "top_view", "oracle")
 
 
 @pytest.mark.parametrize(
