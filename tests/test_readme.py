@@ -10,6 +10,7 @@ import jax
 import numpy as np
 import pytest
 
+from experiments import benchmark, benchmark_targets
 from lala_jax import build, dataset, defaults, options, recording, rollout
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
@@ -61,6 +62,23 @@ def test_scores_are_those_of_the_files(file):
 
 def test_the_table_of_rivals_is_the_one_that_was_written():
     assert (RESULTS / "table1" / "cpu.md").read_text().strip() in section("Results")
+
+
+def test_speeds_are_those_of_the_files():
+    """Every time, ratio and share in the tables, but what was wanted."""
+    known = set()
+    for path in (RESULTS / "benchmark").rglob("*.json"):
+        found = json.loads(path.read_text())
+        rows = [*found["stages"], *(row for one in found["growth"] for row in one["rows"])]
+        known |= {benchmark_targets.seconds_text(row["seconds"]) for row in rows if "seconds" in row}
+        judged = [*found["targets"], *benchmark.judged(found["stages"], found["task"])["targets"]]
+        known |= {benchmark_targets.UNITS[one["unit"]](one["value"]) for one in judged if "value" in one}
+        rates = {row["name"]: row["flops_per_second"] for row in rows if "flops_per_second" in row}
+        known |= {f"{rate / rates['matmul-bfloat16']:.1%}" for rate in rates.values() if "matmul-bfloat16" in rates}
+    cells = [cell.strip() for line in section("Speed").splitlines() if line.startswith("|") for cell in line.split("|")]
+    measured = [cell for cell in cells if not cell.startswith(("at most", "at least"))]
+    named = [text for cell in measured for text in re.findall(r"[\d.]+(?: (?:us|ms|s|times)\b|%)", cell)]
+    assert len(named) > 50 and not [text for text in named if text not in known]
 
 
 def test_links_lead_somewhere():
