@@ -51,7 +51,7 @@ def main(
     every, ceilings = benchmark_stages.STAGES, benchmark_stages.CEILINGS
     known = [name for name in every if name not in ceilings]
     wanted = [options.check_choice("--stages", name, known) for name in stages.split(",") if name] or known
-    before, here = read(against) if against else None, machine()
+    before = read(against) if against else None
     if timed:
         if before is None:
             raise options.OptionsError(f"--timed={timed} is compared with --against=FILE, which is not given")
@@ -60,6 +60,7 @@ def main(
         if slower(before, only(result, wanted), limit):
             raise SystemExit(1)
         return result
+    here = machine()
     if before is not None:
         check_comparable(before, {"task": task, **here}, wanted)
     kind = "".join(letter if letter.isalnum() else "-" for letter in here["device"].lower())
