@@ -91,18 +91,22 @@ def devices(directory):
     assert specs(run) == specs(start(split))
     assert specs(run.params) == {"in": PartitionSpec(None, "data"), "out": PartitionSpec("data"), "odd": PartitionSpec()}
     assert specs(run.average) == specs(run.params) and run.params["in"].addressable_data(0).shape == (16, 3)
-    source = checkpoint.Checkpoints(directory)
-    source.save_latest(3, run, **STORED)
-    for number, shard in ((2, False), (8, False), (2, True), (8, True)):  # the last time from what lies on two
+    on_eight, on_two = checkpoint.Checkpoints(directory), checkpoint.Checkpoints(directory / "on_two")
+    on_eight.save_latest(3, run, **STORED)
+
+    def restored(store, number, *, shard):
         few = Mesh(np.array(jax.devices()[:number]), ("data",))
-        again = loop.start_or_resume(start(probe()), source, CONFIG, dict, mesh=few, shard=shard)
+        again = loop.start_or_resume(start(probe()), store, CONFIG, dict, mesh=few, shard=shard)
         assert specs(again) == {
             name: sharding.spec for name, sharding in checkpoint.named(parallel.shardings(few, run, shard=shard)).items()
         }
         assert test_train_step.bits(again) == test_train_step.bits(run)
-        if (number, shard) == (2, True):
-            source = checkpoint.Checkpoints(directory / "on_two")
-            source.save_latest(3, again, **STORED)
+        return again
+
+    restored(on_eight, 2, shard=False)
+    restored(on_eight, 8, shard=False)
+    on_two.save_latest(3, restored(on_eight, 2, shard=True), **STORED)
+    restored(on_two, 8, shard=True)
     try:
         parallel.mesh("train.batch_size", 12)
     except options.OptionsError as error:

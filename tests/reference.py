@@ -84,6 +84,16 @@ def hourglass(params, x, stages, laterals=None, decoded=None):
     return pair(params, "head", x, last_relu=False)
 
 
+def streams(params, variant, current, goal, stages):
+    """Pass a `streams.Streams`: the paper's three ways to take both images in."""
+    if variant == "single":
+        return hourglass(params["difference"], current - goal, stages)
+    decoded = []
+    first = hourglass(params["current"], current, stages, decoded=decoded)
+    second = hourglass(params["goal"], goal, stages, laterals=decoded if variant == "two_stream_lateral" else None)
+    return conv(np.concatenate([first, second], -1), params["fuse"]) if "fuse" in params else first + second
+
+
 def quarter_crops(x, cell, crop):
     """Cut four crops of `[H, W, C]` about a cell, turned by quarters: row is y, col is x, zero outside."""
     out = np.zeros((4, crop, crop, x.shape[-1]))

@@ -82,10 +82,8 @@ def test_laterals_lead_from_the_current_stream_into_the_goals(fusion):
     net = streams.Streams(2, "two_stream_lateral", fusion, width=4, stages=3)
     current, goal = np.random.default_rng(0).normal(size=(2, 8, 12, 3)).astype(np.float32)
     params = jax.jit(net.init)(jax.random.key(1, impl="rbg"), current, goal)
-    leaves, decoded = params["params"], []
-    first = reference.hourglass(leaves["current"], current, 3, decoded=decoded)
-    second = reference.hourglass(leaves["goal"], goal, 3, laterals=decoded)
-    want = first + second if fusion == "add" else reference.conv(np.concatenate([first, second], -1), leaves["fuse"])
+    assert ("fuse" in params["params"]) == (fusion == "conv")
+    want = reference.streams(params["params"], "two_stream_lateral", current, goal, 3)
     np.testing.assert_allclose(jax.jit(net.apply)(params, current, goal), want, atol=1e-5)
 
 

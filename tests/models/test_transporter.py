@@ -75,14 +75,19 @@ def test_rivals_have_the_public_parameters(variant, goal_nets, public, biases):
     assert intermediates["key"].shape == (384, 224, 3) and intermediates["query"].shape == (36, 64, 64, 3)
 
 
-def _streams(params, variant, current, goal):
-    """The paper's three ways to take both images in, in NumPy, on the parameters of one network."""
-    if variant == "single":
-        return reference.hourglass(params["difference"], current - goal, 2)
-    decoded = []
-    first = reference.hourglass(params["current"], current, 2, decoded=decoded)
-    second = reference.hourglass(params["goal"], goal, 2, laterals=decoded if variant == "two_stream_lateral" else None)
-    return reference.conv(np.concatenate([first, second], -1), params["fuse"]) if "fuse" in params else first + second
+def _padded_and_cropped(*images, cell):
+    """What the pick, the key and the query network see of each image, 12 x 8, with a crop of 8 around `cell`."""
+    square = [np.pad(one, ((0, 0), (2, 2), (0, 0))) for one in images]
+    wide = [np.pad(one, ((4, 4), (4, 4), (0, 0))) for one in images]
+    return square, wide, [reference.quarter_crops(one, cell, 8) for one in images]
+
+
+def _assert_equal(logits, intermediates, pick, key, query):
+    """Compare both logits with those of the three networks' features in NumPy, and key and query with theirs."""
+    for found, wanted in ((logits["pick"], pick[:, 2:-2, 0]), (intermediates["key"], key), (intermediates["query"], query)):
+        np.testing.assert_allclose(found, wanted, atol=1e-4)
+    place = reference.places(key, query) / 8 / 3**0.5
+    np.testing.assert_allclose(logits["place"], place, atol=1e-3 * place.std())
 
 
 @pytest.mark.parametrize("variant", streams.VARIANTS)
@@ -91,17 +96,9 @@ def test_the_papers_agents_equal_their_formulas_in_numpy(variant):
     net = transporter.Transporter(variant, **(SMALL | {"width": 4}))
     maps, cell = np.asarray(_maps()), (8, 2)
     params = _drawn(net, *maps, np.array(cell))
-    logits, intermediates = jax.jit(net.apply)(params, *maps, jnp.array(cell))
-    square = [np.pad(one, ((0, 0), (2, 2), (0, 0))) for one in maps]
-    wide = [np.pad(one, ((4, 4), (4, 4), (0, 0))) for one in maps]
-    crops = [reference.quarter_crops(one, cell, 8) for one in maps]
-    pick, key, query = (
-        _streams(params["params"][f"{name}_net"], variant, *both) for name, both in (("pick", square), ("key", wide), ("query", crops))
-    )
-    for found, wanted in ((logits["pick"], pick[:, 2:-2, 0]), (intermediates["key"], key), (intermediates["query"], query)):
-        np.testing.assert_allclose(found, wanted, atol=1e-4)
-    place = reference.places(key, query) / 8 / 3**0.5
-    np.testing.assert_allclose(logits["place"], place, atol=1e-3 * place.std())
+    seen = zip(("pick", "key", "query"), _padded_and_cropped(*maps, cell=cell), strict=True)
+    features = [reference.streams(params["params"][f"{name}_net"], variant, *both, 2) for name, both in seen]
+    _assert_equal(*jax.jit(net.apply)(params, *maps, jnp.array(cell)), *features)
 
 
 @pytest.mark.parametrize("variant", ["transporter", "image_goal", "goal_split"])
@@ -117,13 +114,11 @@ def test_rivals_equal_their_formulas_in_numpy(variant):
     def features(name, *maps):
         return [reference.hourglass(params["params"][f"{name}_net"], one, 2) for one in maps]
 
-    square = [np.pad(one, ((0, 0), (2, 2), (0, 0))) for one in (current, both)]
-    wide = [np.pad(one, ((4, 4), (4, 4), (0, 0))) for one in (current, goal)]
-    crops = [reference.quarter_crops(one, cell, 8) for one in (current, goal)]
+    square, wide, crops = _padded_and_cropped(current, goal, both, cell=cell)
     if variant == "transporter":
         (pick,), (key,), (query,) = features("pick", square[0]), features("key", wide[0]), features("query", crops[0])
     if variant == "image_goal":
-        (pick,), (key,), (query,) = features("pick", square[1]), features("key", wide[0]), features("query", crops[0])
+        (pick,), (key,), (query,) = features("pick", square[2]), features("key", wide[0]), features("query", crops[0])
         more_key, more_query = features("goal", wide[1], crops[1])
         key, query = key + more_key, query + more_query
     if variant == "goal_split":
@@ -131,11 +126,7 @@ def test_rivals_equal_their_formulas_in_numpy(variant):
             features(name, one) for name, one in (("pick", square[0]), ("key", wide[0]), ("query", wide[0]), ("goal", wide[1]))
         )
         key, query = key * times, reference.quarter_crops(query * times, (12, 6), 8)
-    np.testing.assert_allclose(logits["pick"], pick[:, 2:-2, 0], atol=1e-4)
-    np.testing.assert_allclose(intermediates["key"], key, atol=1e-4)
-    np.testing.assert_allclose(intermediates["query"], query, atol=1e-4)
-    place = reference.places(key, query) / 8 / 3**0.5
-    np.testing.assert_allclose(logits["place"], place, atol=1e-3 * place.std())
+    _assert_equal(logits, intermediates, pick, key, query)
     again, _ = apply(params, current, goal[::-1], jnp.array(cell), both[::-1])
     assert np.array_equal(again["place"], logits["place"]) == (variant == "transporter")
     assert np.array_equal(again["pick"], logits["pick"]) == (variant != "image_goal")
