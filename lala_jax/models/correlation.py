@@ -6,10 +6,11 @@ import functools
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 METHODS = ("auto", "fft", "conv")
 
-# What the platform decides, here and with _CHUNK; anything not named here convolves. In the spectrum the cost hardly grows with
+# What the platform decides, here and in `_correlate_fft`; anything not named here convolves. In the spectrum the cost hardly grows with
 # the crop, where a direct convolution pays for every pixel of it and its gradient is a convolution with a map-sized kernel.
 _METHOD_OF_PLATFORM = {"cpu": "fft", "gpu": "fft"}
 
@@ -52,49 +53,62 @@ def _correlate_conv(key: jax.Array, kernels: jax.Array) -> jax.Array:
 def _correlate_fft(key: jax.Array, kernels: jax.Array) -> jax.Array:
     """Correlate in the spectrum, the channels summed before the inverse so that there is one inverse a kernel."""
     key, kernels = jnp.moveaxis(key.astype(jnp.float32), -1, 0), jnp.moveaxis(kernels.astype(jnp.float32), -1, 1)
-    return _spectral(key, kernels, _CHUNK if jax.default_backend() == "cpu" else len(kernels))
+    on_cpu = jax.default_backend() == "cpu"
+    return _spectral(key, kernels, _CHUNK if on_cpu else len(kernels), on_cpu)
 
 
-# A CPU takes a few kernels at a time, whose spectra then stay in its caches. Taken in turn by hand: two thirds of the time of all at once.
-_CHUNK = 2
+# A CPU takes a few kernels at a time, whose spectra then stay in its caches.
+_CHUNK = 6
 
 
-@functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
-def _spectral(key: jax.Array, kernels: jax.Array, chunk: int) -> jax.Array:
-    """Correlate `[d, rows, cols]` with `[k, d, c, c]`, `chunk` kernels at a time.
+@functools.partial(jax.custom_vjp, nondiff_argnums=(2, 3))
+def _spectral(key: jax.Array, kernels: jax.Array, chunk: int, products: bool) -> jax.Array:
+    """Correlate `[d, rows, cols]` with `[k, d, c, c]`, `chunk` kernels at a time, each transformed by an FFT or by `products`.
 
-    The derivative is written out, since it too needs one inverse a kernel only, and no spectrum of a kernel is kept for it.
+    The derivative is written out, since it too needs one inverse a kernel only.
     """
     rows, cols = key.shape[1:]
-    spectrum, (height, width), _ = _key_spectrum(key, kernels.shape[-1])
+    spectrum, lengths, _ = _key_spectrum(key, kernels.shape[-1])
 
     def some(part):
-        return _irfft2((spectrum * jnp.conj(_rfft2(part, height, width))).sum(1), width, rows, cols)
+        return _irfft2((spectrum * jnp.conj(_kernel_spectra(part, lengths, products))).sum(1), lengths[1], rows, cols)
 
     return _joined(jax.lax.map(some, _chunks(kernels, chunk)), len(kernels))
 
 
-def _spectral_fwd(key, kernels, chunk):
-    return _spectral(key, kernels, chunk), (key, kernels)
+def _spectral_fwd(key, kernels, chunk, products):
+    rows, cols = key.shape[1:]
+    spectrum, lengths, _ = _key_spectrum(key, kernels.shape[-1])
+
+    def some(part):
+        kernel = _kernel_spectra(part, lengths, products)
+        return _irfft2((spectrum * jnp.conj(kernel)).sum(1), lengths[1], rows, cols), kernel
+
+    out, spectra = jax.lax.map(some, _chunks(kernels, chunk))
+    return _joined(out, len(kernels)), (key, kernels, spectra)
 
 
-def _spectral_bwd(chunk, kept, slopes):
-    key, kernels = kept
+def _spectral_bwd(chunk, products, kept, slopes):
+    key, kernels, spectra = kept
     rows, cols, size = *key.shape[1:], kernels.shape[-1]
     spectrum, (height, width), before = _key_spectrum(key, size)
+    back = _irfft2_by_products if products else _irfft2
 
     def some(total, part):
-        kernel, slope = (_rfft2(one, height, width) for one in part)
-        slope = slope[:, None]
-        return total + (slope * kernel).sum(0), _irfft2(spectrum * jnp.conj(slope), width, size, size)
+        kernel, slope = part
+        slope = _rfft2(slope, height, width)[:, None]
+        return total + (slope * kernel).sum(0), back(spectrum * jnp.conj(slope), width, size, size)
 
-    parts = _chunks(kernels, chunk), _chunks(slopes, chunk)
-    total, by_kernel = jax.lax.scan(some, jnp.zeros_like(spectrum), parts)
+    total, by_kernel = jax.lax.scan(some, jnp.zeros_like(spectrum), (spectra, _chunks(slopes, chunk)))
     by_key = _irfft2(total, width, before + rows, before + cols)[:, before:, before:]
     return by_key, _joined(by_kernel, len(kernels))
 
 
 _spectral.defvjp(_spectral_fwd, _spectral_bwd)
+
+
+def _kernel_spectra(kernels, lengths, products):
+    return (_rfft2_by_products if products else _rfft2)(kernels, *lengths)
 
 
 def _key_spectrum(key, size):
@@ -131,6 +145,39 @@ def _rfft2(values: jax.Array, height: int, width: int) -> jax.Array:
 def _irfft2(spectrum: jax.Array, width: int, rows: int, cols: int) -> jax.Array:
     """Give the first `rows` and `cols` of the inverse transform, without transforming the other rows back."""
     return jnp.fft.irfft(jnp.swapaxes(jnp.fft.ifft(spectrum)[..., :rows], -1, -2), n=width)[..., :cols]
+
+
+# A kernel padded to the map is mostly zeros. Products with the few rows of the Fourier matrix that meet the others take a CPU less time
+# than a transform of it all. Complex numbers are pairs there, real and imaginary part.
+
+
+def _rfft2_by_products(values: jax.Array, height: int, width: int) -> jax.Array:
+    """Do what `_rfft2` does."""
+    rows, cols = values.shape[-2:]
+    along_rows = jnp.einsum("...rc,cpw->...wpr", values, _waves(cols, width)[..., : width // 2 + 1])
+    pairs = jnp.einsum("...wpr,prqh->...wqh", along_rows, _turns(rows, height))
+    return jax.lax.complex(pairs[..., 0, :], pairs[..., 1, :])
+
+
+def _irfft2_by_products(spectrum: jax.Array, width: int, rows: int, cols: int) -> jax.Array:
+    """Do what `_irfft2` does: the transposed products, where what stands for two frequencies counts twice."""
+    half, height = spectrum.shape[-2:]
+    pairs = jnp.stack([spectrum.real, spectrum.imag], axis=-2)
+    along_cols = jnp.einsum("...wqh,prqh->...wpr", pairs, _turns(rows, height) / height)
+    twice = np.where(2 * np.arange(half) % width, 2, 1).astype(np.float32)
+    return jnp.einsum("...wpr,cpw->...rc", along_cols, _waves(cols, width)[..., :half] * twice / width)
+
+
+def _waves(count: int, length: int) -> np.ndarray:
+    """Give `exp(-2 pi i n f / length)` for the first `count` of the places `n`: pairs `[count, 2, length]`."""
+    angle = -2 * np.pi / length * (np.outer(np.arange(count), np.arange(length)) % length)
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1).astype(np.float32)
+
+
+def _turns(count: int, length: int) -> np.ndarray:
+    """Give the same as products of pairs, `[2, count, 2, length]`."""
+    real, imag = np.moveaxis(_waves(count, length), 1, 0)
+    return np.stack([np.stack([real, imag], axis=1), np.stack([-imag, real], axis=1)])
 
 
 def _reach(size: int) -> tuple[int, int]:

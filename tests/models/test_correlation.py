@@ -87,12 +87,14 @@ def test_gradients_are_those_of_a_bilinear_form(method):
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.bfloat16])
-@pytest.mark.parametrize("chunk", [1, 2, 4, 9])
-def test_kernels_some_at_a_time_have_the_values_and_gradients_of_a_convolution(monkeypatch, chunk, dtype):
-    """Also where their number does not come out even, and in a batch."""
+@pytest.mark.parametrize("size", [4, 5])
+@pytest.mark.parametrize(("platform", "chunk"), [("cpu", 1), ("cpu", 2), ("cpu", 4), ("cpu", 9), ("gpu", 1)])
+def test_the_spectrum_has_the_values_and_gradients_of_a_convolution(monkeypatch, platform, chunk, size, dtype):
+    """In a batch; kernels all at once, and some at a time by products, also where their number does not come out even."""
+    monkeypatch.setattr(jax, "default_backend", lambda: platform)
     monkeypatch.setattr(correlation, "_CHUNK", chunk)
-    batch = [jnp.stack(leaf).astype(dtype) for leaf in zip(*[_inputs(seed, k=5, size=4) for seed in range(2)], strict=True)]
-    weight = np.random.default_rng(6).normal(size=(2, 5, 9, 6)).astype(np.float32)
+    batch = [jnp.stack(leaf).astype(dtype) for leaf in zip(*[_inputs(seed, cols=7, k=5, size=size) for seed in range(2)], strict=True)]
+    weight = np.random.default_rng(6).normal(size=(2, 5, 9, 7)).astype(np.float32)
 
     def form(key, kernels, method):
         out = jax.vmap(lambda *one: correlation.correlate(*one, method=method))(key, kernels)
