@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lala_jax import build, checkpoint, cluster, compiling, observe, options, pictures, policy, pretrained, rollout, types, writers
+from lala_jax.perception import batches
 from lala_jax.sim import oracle
 from lala_jax.sim.tasks import base
 
@@ -34,17 +35,19 @@ def mount_batch(observer: observe.Observer, key: jax.Array, scenes: types.Scene)
 
 
 @functools.partial(compiling.jit, static_argnums=0)
-def act_batch(agent: policy.Policy, params: Any, scenes: types.Scene, poses: jax.Array, current: types.TopDownMap, goal: types.TopDownMap):
-    """Act in B scenes, one after another: `(PickPlace, best pick and place logits)` with leaves `[B, ...]`.
+def act_batch(
+    agent: policy.Policy, params: Any, scenes: types.Scene, poses: jax.Array, current: types.TopDownMap, goal: types.TopDownMap, count: int
+):
+    """Act in the first `count` of B scenes, one after another: `(PickPlace, best pick and place logits)`, leaves `[B, ...]`, zeros after.
 
     Only a privileged policy is told the scene and the `poses` `[B, N, 7]`, and not what is placed or may go next.
     """
     if not agent.privileged:
-        return jax.lax.map(lambda maps: agent.act(params, *maps), (current, goal))
+        return batches.first(lambda maps: agent.act(params, *maps), (current, goal), count)
     untold = jnp.zeros(poses.shape[:2], bool)
     fields = {name: getattr(scenes, name) for name in ("size", "color", "base", "goal", "symmetry")}
     truth = types.State(**fields, poses=poses, placed=untold, ready=untold)
-    return jax.lax.map(lambda seen: agent.act(params, *seen), (current, goal, truth))
+    return batches.first(lambda seen: agent.act(params, *seen), (current, goal, truth), count)
 
 
 @jax.jit
@@ -69,12 +72,13 @@ class PolicyAgent:
 
     def _think(self, indices, poses):
         """Look at up to `parallel` moments of these episodes and act in them: maps, actions and logits `[parallel, ...]`, padding last."""
+        count = len(indices)
         index = np.resize(indices, self._parallel)
         poses = np.resize(poses, (self._parallel, *np.shape(poses)[1:]))
         scenes, rig, goal = _take((self._scenes, self.rig, self.goal), index)
         poses = jnp.asarray(poses, jnp.float32)
         current = self._look(scenes, poses, rig)
-        return current, *act_batch(self._agent, self._params, scenes, poses, current, goal)
+        return current, *act_batch(self._agent, self._params, scenes, poses, current, goal, count)
 
     def __call__(self, indices: Sequence[int], poses: np.ndarray) -> list[types.PickPlace]:
         action = jax.device_get(self._think(indices, poses)[1])
