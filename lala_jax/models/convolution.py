@@ -51,7 +51,8 @@ def product_gradient(
 
     Maps `lhs` `[B, H, W, C]` and `rhs` `[kh, kw, C, O]` to `[B, H', W', O]`. XLA's gradient is a convolution over `lhs` with channels in
     the place of the batch, and a CPU brings `lhs` into that order first, entry by entry, with whatever made it. The product reads it as it
-    lies, and for each entry of the kernel the slope: `kh kw O` values a cell, so `C` should not be much smaller than that.
+    lies, and for each entry of the kernel the slope: `kh kw O` values a cell, so `C` should not be much smaller than that. It is taken
+    before the gradient of `lhs`, which is not finite where the kernel's is not.
 
     Raises ValueError for dilation or groups, and for strides unless the kernel is 1x1 and nothing is padded. There is no derivative in
     forward mode.
@@ -73,7 +74,8 @@ def product_gradient(
         moved = [wide[:, i : i + rows, j : j + cols] for i in reversed(range(down)) for j in reversed(range(right))]
         product = jnp.einsum("bhwc,bhwo->co", read, jnp.concatenate(moved, -1), precision=kwargs.get("precision"))
         kernel = product.reshape(rhs.shape[2], down, right, -1).transpose(1, 2, 0, 3)
-        return jax.vjp(lambda lhs: plain(lhs, rhs), lhs)[1](slope)[0], kernel
+        first = rhs + 0 * kernel  # XLA would put the kernel's gradient off, and keep what it needs of every layer until the end
+        return jax.vjp(lambda lhs: plain(lhs, first), lhs)[1](slope)[0], kernel
 
     convolve = jax.custom_vjp(plain)
     convolve.defvjp(lambda lhs, rhs: (plain(lhs, rhs), (lhs, rhs)), backward)
