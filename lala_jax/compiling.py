@@ -48,14 +48,16 @@ def build(jitted, *arguments: Any) -> tuple[Any, dict[str, float]]:
     Gives the program, which takes those that are not static, and facts: `compile_seconds`, the `flops` of a run (see `flops`), the
     `bytes` that it moves as XLA counts them (of a program with a loop, whose body XLA counts once, the least that it moves: arguments and
     results), and the `memory` in bytes that it needs: arguments, results (those in donated memory once) and what is between. On a CPU a
-    program that needs more than LARGE is compiled once more, LEAN, and the memory that compiling has left is given back.
+    program that needs more than LARGE is compiled LEAN, and the memory that compiling has left is given back.
     """
     begin = time.perf_counter()
     traced = jitted.trace(*arguments)
-    lowered = traced.lower()
-    program = lowered.compile()
-    if memory_of(program) > LARGE and jax.default_backend() == "cpu":
-        program = lowered.compile(LEAN)
+    lowered, on_cpu = traced.lower(), jax.default_backend() == "cpu"
+    large = on_cpu and stored(traced.jaxpr) > LARGE
+    program = lowered.compile(LEAN if large else None)
+    if on_cpu and not large and memory_of(program) > LARGE:
+        program, large = lowered.compile(LEAN), True
+    if large:
         _glibc("malloc_trim", 0)
     facts = {"compile_seconds": time.perf_counter() - begin}
     plan = program.memory_analysis() if _loops(traced.jaxpr) else None
@@ -96,8 +98,22 @@ def flops(jaxpr) -> float:
     unknown length once, and of branches the dearest. What no result needs is not counted: a derivative written by hand may give more than
     is asked for, and XLA leaves that out.
     """
+    return _counted(_needed(jaxpr), _flops_of, loops=True)
+
+
+def stored(jaxpr) -> float:
+    """Count the bytes that a jaxpr's matrix products, convolutions and Fourier transforms give, of a loop one round's.
+
+    XLA fuses none of them, so that each has memory. In its usual order on a CPU, a training step of our networks needs that much and up
+    to a third more.
+    """
+    return _counted(_needed(jaxpr), lambda equation: float(sum(one.aval.size * one.aval.dtype.itemsize for one in equation.outvars)))
+
+
+def _needed(jaxpr):
+    """Give the jaxpr without what no result needs."""
     whole = getattr(jaxpr, "jaxpr", jaxpr)
-    return _counted(partial_eval.dce_jaxpr(whole, [True] * len(whole.outvars))[0])
+    return partial_eval.dce_jaxpr(whole, [True] * len(whole.outvars))[0]
 
 
 def _loops(jaxpr) -> bool:
@@ -107,16 +123,22 @@ def _loops(jaxpr) -> bool:
     return any(equation.primitive.name in ("scan", "while") for equation in equations) or any(map(_loops, within))
 
 
-def _counted(jaxpr) -> float:
+def _counted(jaxpr, count: Callable[[Any], float], *, loops: bool = False) -> float:
+    """Sum `count` over the equations of _COUNTS, of branches the dearest, of a scan as often as it runs if `loops`, else once."""
     total = 0.0
     for equation in getattr(jaxpr, "jaxpr", jaxpr).eqns:
         name, params = equation.primitive.name, equation.params
         if name in _COUNTS:
-            total += _COUNTS[name](params, *(variable.aval.shape for variable in (*equation.invars, *equation.outvars)))
-        within = [_counted(one) for value in params.values() for one in _jaxprs(value)]
+            total += count(equation)
+        within = [_counted(one, count, loops=loops) for value in params.values() for one in _jaxprs(value)]
         if within:
-            total += max(within) if name == "cond" else sum(within) * (params["length"] if name == "scan" else 1)
+            total += max(within) if name == "cond" else sum(within) * (params["length"] if loops and name == "scan" else 1)
     return total
+
+
+def _flops_of(equation) -> float:
+    shapes = (variable.aval.shape for variable in (*equation.invars, *equation.outvars))
+    return _COUNTS[equation.primitive.name](equation.params, *shapes)
 
 
 def _jaxprs(value: Any) -> list[Any]:

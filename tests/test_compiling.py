@@ -109,15 +109,17 @@ def test_donated_memory_is_counted_once_and_static_arguments_are_left_out():
     assert float(program(x)[0]) == 3.0 and x.is_deleted()
 
 
-def test_a_large_program_takes_less_memory_on_a_cpu(monkeypatch):
-    """Here eight branches that could run at once."""
+@pytest.mark.parametrize("foreseen", [True, False])
+def test_a_large_program_takes_less_memory_on_a_cpu(foreseen, monkeypatch):
+    """Here eight branches that could run at once; by what is stored, before it is compiled, or by what it would need."""
 
     def loss(weights, x):
         hidden = [jnp.tanh(x @ w) for w in weights]
         return sum((y @ w.T).sum() for y, w in zip(hidden, weights, strict=True))
 
     weights, x = jnp.ones((8, 64, 512)), jnp.ones((512, 64))
-    found, given_back = [], []
+    found, given_back, stored = [], [], compiling.stored
+    monkeypatch.setattr(compiling, "stored", lambda jaxpr: stored(jaxpr) if foreseen else 0.0)
     monkeypatch.setattr(compiling, "_glibc", lambda *call: given_back.append(call))
     for platform, limit in (("cpu", 1 << 30), ("cpu", 1 << 20), ("tpu", 1 << 20)):
         monkeypatch.setattr(compiling, "LARGE", limit)
@@ -155,6 +157,22 @@ def test_operations_are_those_that_xla_counts(function, shapes):
     traced = jax.jit(function).trace(*[jnp.ones(shape) for shape in shapes])
     cost = traced.lower().cost_analysis()
     assert cost is not None and compiling.flops(traced.jaxpr) == pytest.approx(cost["flops"], rel=0.02)
+
+
+def test_what_is_stored_is_what_products_convolutions_and_transforms_give():
+    """Of a loop one round's, of branches the larger, and nothing that no result needs or that is no such operation."""
+
+    def run(x):
+        def round_(total, _):
+            return total + jnp.fft.rfft(x @ x).real.sum(), None
+
+        looped = jax.lax.scan(round_, 0.0, None, length=7)[0]
+        branch = jax.lax.cond(looped > 0, lambda: (x[:2] @ x).sum(), lambda: (x @ x[:, :3] @ x[:3]).sum())
+        return jnp.sin(x).sum() + branch, (x @ x @ x)[:0]
+
+    whole = 4 * (10 * 10 + 10 * 6 * 2 + (10 * 3 + 10 * 10) + 2 * 10 * 10)
+    assert compiling.stored(jax.jit(run).trace(jnp.ones((10, 10))).jaxpr) == whole
+    assert compiling.stored(jax.jit(lambda x: run(x)[0]).trace(jnp.ones((10, 10))).jaxpr) == whole - 4 * 200
 
 
 def test_what_no_result_needs_is_not_counted():
