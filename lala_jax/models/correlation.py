@@ -65,24 +65,19 @@ _CHUNK = 6
 def _spectral(key: jax.Array, kernels: jax.Array, chunk: int, products: bool) -> jax.Array:
     """Correlate `[d, rows, cols]` with `[k, d, c, c]`, `chunk` kernels at a time, each transformed by an FFT or by `products`.
 
-    The derivative is written out, since it too needs one inverse a kernel only.
+    The derivative is written out, since it too needs one inverse a kernel only. Where none is taken, XLA drops the spectra kept for it.
     """
-    rows, cols = key.shape[1:]
-    spectrum, lengths, _ = _key_spectrum(key, kernels.shape[-1])
-
-    def some(part):
-        return _irfft2((spectrum * jnp.conj(_kernel_spectra(part, lengths, products))).sum(1), lengths[1], rows, cols)
-
-    return _joined(jax.lax.map(some, _chunks(kernels, chunk)), len(kernels))
+    return _spectral_fwd(key, kernels, chunk, products)[0]
 
 
 def _spectral_fwd(key, kernels, chunk, products):
     rows, cols = key.shape[1:]
-    spectrum, lengths, _ = _key_spectrum(key, kernels.shape[-1])
+    spectrum, (height, width), _ = _key_spectrum(key, kernels.shape[-1])
+    transform = _rfft2_by_products if products else _rfft2
 
     def some(part):
-        kernel = _kernel_spectra(part, lengths, products)
-        return _irfft2((spectrum * jnp.conj(kernel)).sum(1), lengths[1], rows, cols), kernel
+        kernel = transform(part, height, width)
+        return _irfft2((spectrum * jnp.conj(kernel)).sum(1), width, rows, cols), kernel
 
     out, spectra = jax.lax.map(some, _chunks(kernels, chunk))
     return _joined(out, len(kernels)), (key, kernels, spectra)
@@ -105,10 +100,6 @@ def _spectral_bwd(chunk, products, kept, slopes):
 
 
 _spectral.defvjp(_spectral_fwd, _spectral_bwd)
-
-
-def _kernel_spectra(kernels, lengths, products):
-    return (_rfft2_by_products if products else _rfft2)(kernels, *lengths)
 
 
 def _key_spectrum(key, size):
