@@ -74,8 +74,8 @@ def product_gradient(
         moved = [wide[:, i : i + rows, j : j + cols] for i in reversed(range(down)) for j in reversed(range(right))]
         product = jnp.einsum("bhwc,bhwo->co", read, jnp.concatenate(moved, -1), precision=kwargs.get("precision"))
         kernel = product.reshape(rhs.shape[2], down, right, -1).transpose(1, 2, 0, 3)
-        first = rhs + 0 * kernel  # XLA would put the kernel's gradient off, and keep what it needs of every layer until the end
-        return jax.vjp(lambda lhs: plain(lhs, first), lhs)[1](slope)[0], kernel
+        waiting = rhs + 0 * kernel  # XLA would put the kernel's gradient off, and keep what it needs of every layer until the end
+        return jax.vjp(lambda lhs: plain(lhs, waiting), lhs)[1](slope)[0], kernel
 
     convolve = jax.custom_vjp(plain)
     convolve.defvjp(lambda lhs, rhs: (plain(lhs, rhs), (lhs, rhs)), backward)

@@ -65,7 +65,8 @@ _CHUNK = 6
 def _spectral(key: jax.Array, kernels: jax.Array, chunk: int, products: bool) -> jax.Array:
     """Correlate `[d, rows, cols]` with `[k, d, c, c]`, `chunk` kernels at a time, each transformed by an FFT or by `products`.
 
-    The derivative is written out, since it too needs one inverse a kernel only. Where none is taken, XLA drops the spectra kept for it.
+    The derivative is written out, since it too needs one inverse a kernel only. In a jitted function that takes none, XLA drops the
+    spectra kept for it.
     """
     return _spectral_fwd(key, kernels, chunk, products)[0]
 

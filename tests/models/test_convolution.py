@@ -86,6 +86,18 @@ def test_the_input_is_not_turned_for_it():
     assert turned in text(jax.lax.conv_general_dilated) and turned not in text(convolution.product_gradient)
 
 
+def test_the_inputs_gradient_waits_for_the_kernels():
+    """As a kernel's gradient that is not finite shows, though nothing that the input's is made of is so."""
+    x, kernel = jnp.ones((1, 4, 4, 5)).at[0, 0, 0, 0].set(jnp.inf), jnp.ones((1, 1, 5, 4))
+
+    def slope(convolve):
+        return jax.jit(jax.grad(lambda x, kernel: convolve(x, kernel, (1, 1), ((0, 0), (0, 0)), dimension_numbers=NUMBERS).sum(), (0, 1)))
+
+    (waited, found), (at_once, wanted) = (slope(one)(x, kernel) for one in (convolution.product_gradient, jax.lax.conv_general_dilated))
+    np.testing.assert_array_equal(found, wanted)
+    assert not np.isfinite(found).all() and np.isfinite(at_once).all() and np.isnan(waited).any()
+
+
 @pytest.mark.parametrize(
     "change, message",
     [
