@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import concurrent.futures
 import functools
+import math
 import pathlib
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -13,11 +15,12 @@ import numpy as np
 
 from lala_jax import build, checkpoint, cluster, compiling, observe, options, pictures, policy, pretrained, rollout, types, writers
 from lala_jax.perception import batches
-from lala_jax.sim import oracle
+from lala_jax.sim import oracle, physics
 from lala_jax.sim.tasks import base
 
 AGENTS = ("policy", *oracle.AGENTS)
 FAILURES = 3  # failed episodes that are drawn
+SIDE_BY_SIDE = 4  # episodes in which a policy acts at the same time, at most: each takes its memory
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -34,20 +37,21 @@ def mount_batch(observer: observe.Observer, key: jax.Array, scenes: types.Scene)
     return observer.mount(key, scenes.size, scenes.color, scenes.base, scenes.start)
 
 
-@functools.partial(compiling.jit, static_argnums=0)
+@functools.partial(compiling.jit, static_argnums=(0, 1))
 def act_batch(
-    agent: policy.Policy, params: Any, scenes: types.Scene, poses: jax.Array, current: types.TopDownMap, goal: types.TopDownMap, count: int
-):
-    """Act in the first `count` of B scenes, one after another: `(PickPlace, best pick and place logits)`, leaves `[B, ...]`, zeros after.
+    agent: policy.Policy, most: int, params: Any, scenes: types.Scene, poses: jax.Array, current: types.TopDownMap, goal: types.TopDownMap,
+    start: int, count: int,
+):  # fmt: skip
+    """Act in `count` of B scenes from `start` on, one after another: `(PickPlace, logits)`, leaves `[most, ...]`, zeros after them.
 
     Only a privileged policy is told the scene and the `poses` `[B, N, 7]`, and not what is placed or may go next.
     """
-    if not agent.privileged:
-        return batches.first(lambda maps: agent.act(params, *maps), (current, goal), count)
-    untold = jnp.zeros(poses.shape[:2], bool)
-    fields = {name: getattr(scenes, name) for name in ("size", "color", "base", "goal", "symmetry")}
-    truth = types.State(**fields, poses=poses, placed=untold, ready=untold)
-    return batches.first(lambda seen: agent.act(params, *seen), (current, goal, truth), count)
+    seen: tuple[Any, ...] = (current, goal)
+    if agent.privileged:
+        untold = jnp.zeros(poses.shape[:2], bool)
+        fields = {name: getattr(scenes, name) for name in ("size", "color", "base", "goal", "symmetry")}
+        seen = (*seen, types.State(**fields, poses=poses, placed=untold, ready=untold))
+    return batches.stretch(lambda one: agent.act(params, *one), seen, start, count, most=most)
 
 
 @jax.jit
@@ -56,10 +60,19 @@ def _take(tree: Any, index: jax.Array) -> Any:
 
 
 class PolicyAgent:
-    """A policy as a `rollout.Agent` over up to `parallel` episodes: pads to one shape, so that there is one compilation."""
+    """A policy as a `rollout.Agent` over up to `parallel` episodes: pads to one shape, so that there is one compilation.
 
-    def __init__(self, agent: policy.Policy, params: Any, observer: observe.Observer, scenes: Sequence[types.Scene], *, parallel: int, key):
+    On a CPU up to SIDE_BY_SIDE of `threads` act at the same time, which changes no action: a network for one episode does not fill the
+    cores. `threads` 0 are as many as there are cores.
+    """
+
+    def __init__(
+        self, agent: policy.Policy, params: Any, observer: observe.Observer, scenes: Sequence[types.Scene], *, parallel: int, key,
+        threads: int = 1,
+    ):  # fmt: skip
         self.observer, self._agent, self._params, self._parallel = observer, agent, params | agent.frozen, parallel
+        self._parts = min(threads or physics.cores(), parallel, SIDE_BY_SIDE) if jax.default_backend() == "cpu" else 1
+        self._most = math.ceil(parallel / self._parts)
         padded = [*scenes, *[scenes[0]] * (parallel - len(scenes))]
         self._scenes = jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *padded)
         self._key, key = jax.random.split(key)
@@ -71,26 +84,42 @@ class PolicyAgent:
         return observe_batch(self.observer, scenes, poses, key, rig)
 
     def _think(self, indices, poses):
-        """Look at up to `parallel` moments of these episodes and act in them: maps, actions and logits `[parallel, ...]`, padding last."""
-        count = len(indices)
+        """Look at up to `parallel` moments of these episodes and act in them.
+
+        Gives maps `[parallel, ...]`, padding last, and of each part of the moments their number and `(action, logits)` `[most, ...]`.
+        """
         index = np.resize(indices, self._parallel)
         poses = np.resize(poses, (self._parallel, *np.shape(poses)[1:]))
         scenes, rig, goal = _take((self._scenes, self.rig, self.goal), index)
         poses = jnp.asarray(poses, jnp.float32)
         current = self._look(scenes, poses, rig)
-        return current, *act_batch(self._agent, self._params, scenes, poses, current, goal, count)
+
+        def act(part):
+            thought = act_batch(self._agent, self._most, self._params, scenes, poses, current, goal, int(part[0]), len(part))
+            return len(part), jax.block_until_ready(thought)
+
+        parts = [part for part in np.array_split(np.arange(len(indices)), self._parts) if len(part)]
+        with concurrent.futures.ThreadPoolExecutor(self._parts) as pool:
+            return current, list(pool.map(act, parts))
 
     def __call__(self, indices: Sequence[int], poses: np.ndarray) -> list[types.PickPlace]:
-        action = jax.device_get(self._think(indices, poses)[1])
-        return [jax.tree.map(lambda leaf: leaf[i], action) for i in range(len(indices))]  # noqa: B023
+        _, thoughts = self._think(indices, poses)
+        return [action for count, (actions, _) in thoughts for action in _rows(actions, count)]
 
     def think_again(self, moments: Sequence[tuple[int, np.ndarray]]) -> Iterator[tuple[types.TopDownMap, policy.Heatmaps]]:
         """Give what is seen and thought at each of `moments`, an episode's index and the object poses `[N, 7]`; noise is drawn afresh."""
         for start in range(0, len(moments), self._parallel):
             batch = moments[start : start + self._parallel]
-            current, _, heat = jax.device_get(self._think([index for index, _ in batch], np.stack([poses for _, poses in batch])))
-            for i in range(len(batch)):
-                yield jax.tree.map(lambda leaf: leaf[i], (current, heat))  # noqa: B023
+            current, thoughts = self._think([index for index, _ in batch], np.stack([poses for _, poses in batch]))
+            heat = (one for count, (_, heats) in thoughts for one in _rows(heats, count))
+            yield from zip(_rows(current, len(batch)), heat, strict=True)
+
+
+def _rows(tree: Any, count: int) -> Iterator[Any]:
+    """Fetch a pytree with leaves `[B, ...]` and give its first `count` items one by one."""
+    fetched = jax.device_get(tree)
+    for i in range(count):
+        yield jax.tree.map(lambda leaf: leaf[i], fetched)  # noqa: B023
 
 
 def evaluate(
@@ -120,7 +149,8 @@ def _closed_loop(
         chunk, scenes = task.roomy_lists(seeds[start : start + parallel])
         if not chunk:
             continue
-        actor = PolicyAgent(agent, params, observer, scenes, parallel=parallel, key=jax.random.fold_in(jax.random.key(seed), start))
+        key = jax.random.fold_in(jax.random.key(seed), start)
+        actor = PolicyAgent(agent, params, observer, scenes, parallel=parallel, key=key, threads=threads)
         done = rollout.run(task, scenes, chunk, actor, threads=threads)
         names = {("episode", start + i): i for i in range(min(strips - start, len(done)))}
         if strips:

@@ -28,16 +28,19 @@ def each(function: Callable[[Any], Any], items: Any, *, method: str = "auto", at
     return jax.vmap(function)(items) if at_once is None or count <= at_once else jax.lax.map(function, items, batch_size=at_once)
 
 
-def first(function: Callable[[Any], Any], items: Any, count: int | jax.Array) -> Any:
-    """Apply a function to the first `count` items of a pytree with leaves `[B, ...]`, one after the other, and give leaves `[B, ...]`.
+def stretch(function: Callable[[Any], Any], items: Any, start: int | jax.Array, count: int | jax.Array, *, most: int) -> Any:
+    """Apply a function to `count` items from `start` on, of a pytree with leaves `[B, ...]`, one after the other: leaves `[most, ...]`.
 
-    The rest is zeros, or False, and costs nothing. One program for every `count`; no reverse-mode derivative.
+    The rest is zeros, or False, and costs nothing. One program for every `start` and `count`; no reverse-mode derivative.
     """
     function = jax.jit(function)  # traced once for both
 
     def item(i):
         return jax.tree.map(lambda leaf: leaf[i], items)
 
-    length = len(jax.tree.leaves(items)[0])
-    blank = jax.tree.map(lambda leaf: jnp.zeros((length, *leaf.shape), leaf.dtype), jax.eval_shape(function, item(0)))
-    return jax.lax.fori_loop(0, count, lambda i, done: jax.tree.map(lambda all_, one: all_.at[i].set(one), done, function(item(i))), blank)
+    blank = jax.tree.map(lambda leaf: jnp.zeros((most, *leaf.shape), leaf.dtype), jax.eval_shape(function, item(0)))
+
+    def put(i, done):
+        return jax.tree.map(lambda all_, one: all_.at[i].set(one), done, function(item(start + i)))
+
+    return jax.lax.fori_loop(0, count, put, blank)

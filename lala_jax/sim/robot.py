@@ -234,15 +234,20 @@ def reachable(xyz: np.ndarray, yaw: float | None = None) -> bool | np.ndarray:
     return bool(inside) if inside.ndim == 0 else inside
 
 
+def _run(start: int) -> slice:
+    """Give where the six of a chain lie, one after the other: a slice is read several times as fast as six indices."""
+    return slice(int(start), int(start) + len(JOINTS))
+
+
 class Arm:
     """Where the arm's joints live in a compiled model, and how to command them."""
 
     def __init__(self, model: mujoco.MjModel):
-        joints = [model.joint(name).id for name in JOINTS]
+        first = model.joint(JOINTS[0]).id
         self.model = model
-        self.qpos = model.jnt_qposadr[joints]  # [6] into data.qpos
-        self.dof = model.jnt_dofadr[joints]  # [6] into data.qvel
-        self.actuators = np.array([model.actuator(name).id for name in ACTUATORS])  # [6] into data.ctrl
+        self.qpos = _run(model.jnt_qposadr[first])  # into data.qpos
+        self.dof = _run(model.jnt_dofadr[first])  # into data.qvel
+        self.actuators = _run(model.actuator(ACTUATORS[0]).id)  # into data.ctrl
         self._gain = model.actuator_gainprm[self.actuators, 0]
         self._damping = -model.actuator_biasprm[self.actuators, 2]
         self._acceleration = np.zeros(model.nv)

@@ -39,19 +39,19 @@ def test_some_at_a_time_give_what_all_do(at_once, groups):
     assert sorted(map(int, re.findall(r"sine .*tensor<(\d)x5xf32>", text)), reverse=True) == groups
 
 
-def test_the_first_are_as_all_and_the_rest_is_blank_by_one_program():
+def test_a_stretch_is_as_all_are_and_the_rest_is_blank_by_one_program():
     items = {"a": jax.random.normal(jax.random.key(0), (4, 5)), "b": jnp.arange(4)}
 
     def one(item):
         return jnp.sin(item["a"]), {"odd": item["b"] % 2 == 1, "next": item["b"] + 1}
 
-    program = jax.jit(lambda items, count: batches.first(one, items, count))
-    for count in range(5):
-        sines, more = program(items, count)
-        np.testing.assert_allclose(sines[:count], np.sin(np.asarray(items["a"][:count])), rtol=1e-5)
-        np.testing.assert_array_equal(more["next"], [1, 2, 3, 4][:count] + [0] * (4 - count))
-        np.testing.assert_array_equal(more["odd"], [False, True, False, True][:count] + [False] * (4 - count))
-        assert not np.any(sines[count:])
+    program = jax.jit(lambda items, start, count: batches.stretch(one, items, start, count, most=3))
+    for start, count in [(0, 0), (0, 1), (0, 3), (1, 3), (2, 2), (3, 1)]:
+        sines, more = program(items, start, count)
+        np.testing.assert_allclose(sines[:count], np.sin(np.asarray(items["a"][start : start + count])), rtol=1e-5)
+        np.testing.assert_array_equal(more["next"], [1, 2, 3, 4][start : start + count] + [0] * (3 - count))
+        np.testing.assert_array_equal(more["odd"], [False, True, False, True][start : start + count] + [False] * (3 - count))
+        assert len(sines) == 3 and not np.any(sines[count:])
     assert program._cache_size() == 1
 
 

@@ -82,8 +82,35 @@ def test_perfect_actions_build_a_tower_that_stays(world):
     assert np.abs(poses[:, 2] - goal[:, 2]).max() < 2e-4
     assert np.abs(wrapped(yaw_of(poses) - yaw_of(goal), np.pi / 2)).max() < np.deg2rad(0.5)
     assert tilt_of(poses).max() < np.deg2rad(0.5)
+    awake(world)
     mujoco.mj_step(world.model, world.data, round(10.0 / world.model.opt.timestep))
     np.testing.assert_allclose(world.poses(), poses, atol=1e-5)
+
+
+def awake(world):
+    """Simulate at all times what rests as well."""
+    world.model.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_SLEEP)
+    world.reset(world.poses())
+
+
+@pytest.mark.parametrize("over", [0.0, 0.024, 0.029])  # metres along x off the middle of the cube below, whose edge is at 0.026
+def test_what_sleeps_does_as_it_does_awake(world, monkeypatch, over):
+    """It wakes when it is picked, put something on, and knocked over; most of the time all sleeps but the arm and what it holds."""
+    other, counts = physics.World(task(), scene()), []
+    awake(other)
+    real = mujoco.mj_step
+    monkeypatch.setattr(mujoco, "mj_step", lambda model, data, n=1: [real(model, data, n), counts.append(data.ntree_awake)][0])
+    places = [scene().goal[0], scene().goal[1] + [over, *[0.0] * 6], pose(0.45, 0.3, CUBE / 2, 0.2)]
+    for i, place in enumerate(places):
+        done = action(world.poses()[i], place)
+        counts.clear()
+        mine = world.step(done)
+        assert np.median(counts) <= 2 and max(counts) >= 2, counts
+        theirs = other.step(done)
+        assert mine.ok and (mine.object, mine.reason) == (theirs.object, theirs.reason) and abs(mine.seconds - theirs.seconds) < 0.05
+        np.testing.assert_allclose(world.poses(), other.poses(), atol=5e-4 if over < 0.026 else 1e-2)  # no fall is like another
+    fallen = tilt_of(world.poses()).max() > 0.1 or np.abs(world.poses()[1, 2] - scene().goal[1, 2]) > 0.01
+    assert fallen == (over > 0.026)
 
 
 def test_an_action_is_a_function_of_the_poses_bit_for_bit(world):
