@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import functools
+import gc
 import math
 import os
 import pathlib
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -26,6 +28,8 @@ OPTIONS = {"xla_cpu_experimental_ynn_fusion_type": ""}
 LEAN = {"xla_cpu_scheduler_type": "CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED"}
 LARGE = 2 << 30  # bytes
 
+DRAWN_SIZES = tuple(4**i for i in range(4, 16))  # how many random numbers `step_by_step` draws at once
+_DRAWS = {"_truncated_normal": jax.random.truncated_normal, "_normal": jax.random.normal}
 _MIN_SECONDS = "jax_persistent_cache_min_compile_time_secs"  # JAX's setting: what took less to compile is not kept
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8  # of glibc's malloc.h
 
@@ -42,6 +46,19 @@ def jit_step(function: Callable[..., Any], *, state: int = 0, **how: Any):
     return jit(function, donate_argnums=() if jax.default_backend() == "gpu" else state, **how)
 
 
+@contextlib.contextmanager
+def uncollected() -> Iterator[None]:
+    """Let Python look for no garbage meanwhile: tracing makes a million small objects that stay, a quarter of its time is looking."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+@uncollected()
 def build(jitted, *arguments: Any) -> tuple[Any, dict[str, float]]:
     """Compile a jitted function for its arguments, static ones among them, without running it.
 
@@ -66,21 +83,61 @@ def build(jitted, *arguments: Any) -> tuple[Any, dict[str, float]]:
     return program, facts | {name: float(count) for name, count in counts.items() if count > 0}
 
 
+@uncollected()
 def step_by_step(function: Callable[..., Any], *arguments: Any) -> Any:
     """Call a function of arrays operation by operation, only those that its results need, each kind of each shape compiled once.
 
     For what runs once and does one thing over and over, such as drawing parameters: a jitted `init` compiles every draw anew. What is
-    jitted within `function` stays one operation.
+    jitted within `function` stays one operation. Of those that `init` is made of, some are not even compiled for each shape: NumPy
+    multiplies, repeats and copies, and of random numbers only DRAWN_SIZES are drawn.
     """
     traced, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
     needed, _ = partial_eval.dce_jaxpr(traced.jaxpr, [True] * len(traced.jaxpr.outvars), instantiate=True)
-    results = core.jaxpr_as_fun(core.ClosedJaxpr(needed, traced.consts))(*jax.tree.leaves(arguments))
-    return jax.tree.unflatten(jax.tree.structure(shapes), results)
+    known = dict(zip((*needed.constvars, *needed.invars), (*traced.consts, *jax.tree.leaves(arguments)), strict=True))
+    last = {variable: i for i, one in enumerate(needed.eqns) for variable in _variables(one.invars)}
+    last |= dict.fromkeys(_variables(needed.outvars), len(needed.eqns))
+
+    def read(one):
+        return one.val if isinstance(one, core.Literal) else known[one]
+
+    for i, equation in enumerate(needed.eqns):
+        known |= zip(equation.outvars, _result(equation, [read(one) for one in equation.invars], needed.debug_info), strict=True)
+        for variable in _variables(equation.invars):
+            if last[variable] == i:
+                known.pop(variable, None)  # twice where an operation has it twice
+    results = [(read(one), one.aval.dtype) for one in needed.outvars]
+    arrays = [one if isinstance(one, jax.Array) else jax.device_put(np.array(one, dtype)) for one, dtype in results]
+    return jax.tree.unflatten(jax.tree.structure(shapes), arrays)
 
 
 def draw(init: Callable[..., Any], seed: int, *arguments: Any) -> Any:
     """Draw a network's parameters, `init(key, *arguments)`, by `step_by_step` and with a key that compiles in a quarter of the time."""
     return step_by_step(init, jax.random.key(seed, impl="rbg"), *arguments)
+
+
+def _variables(some):
+    return [one for one in some if not isinstance(one, core.Literal)]
+
+
+def _result(equation, given, debug_info) -> list[Any]:
+    """Give the results of one operation of a jaxpr."""
+    name, params, dtypes = equation.primitive.name, equation.params, [one.aval.dtype for one in equation.outvars]
+    shape, dtype = (equation.outvars[0].aval.shape, dtypes[0]) if len(dtypes) == 1 and isinstance(dtypes[0], np.dtype) else ((), None)
+    if name == "jit" and params["name"] in _DRAWS and dtype == np.float32 and jax.random.key_impl(given[0]) == "rbg":
+        count = math.prod(shape)  # of more numbers the first are the same ones
+        size = next((size for size in DRAWN_SIZES if size >= count), count)
+        return [np.asarray(_DRAWS[params["name"]](*given, shape=(size,), dtype=dtype))[:count].reshape(shape)]
+    if name == "mul" and dtype == np.float32:
+        return [np.multiply(*map(np.asarray, given))]
+    if name == "copy" and dtype is not None:
+        return [np.asarray(given[0])]
+    if name == "broadcast_in_dim" and dtype is not None and len(given) == 1:
+        axes = params["broadcast_dimensions"]
+        sides = [np.shape(given[0])[axes.index(axis)] if axis in axes else 1 for axis in range(len(shape))]
+        return [np.broadcast_to(np.asarray(given[0], dtype).reshape(sides), shape)]
+    alone = {one: value for one, value in zip(equation.invars, given, strict=True) if not isinstance(one, core.Literal)}
+    jaxpr = core.Jaxpr((), list(alone), equation.outvars, [equation], debug_info=debug_info.with_unknown_names())
+    return core.jaxpr_as_fun(core.ClosedJaxpr(jaxpr, ()))(*alone.values())
 
 
 def memory_of(program) -> float:

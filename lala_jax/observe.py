@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from lala_jax import backbone, types
+from lala_jax import backbone, compiling, types
 from lala_jax.perception import batches, calibration, noise, topdown
 from lala_jax.perception import camera as cameras
 from lala_jax.sim import distance, render, scene
@@ -171,6 +171,7 @@ _load = functools.lru_cache(maxsize=2)(lambda name, stage, dtype: backbone.load(
 
 
 @functools.cache
+@compiling.uncollected()
 def _background(observer: Observer) -> render.Layer:
     model, data = scene.geom_template(observer.task)
     with jax.ensure_compile_time_eval():

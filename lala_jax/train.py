@@ -63,7 +63,8 @@ def _note_start(config, out: pathlib.Path, learnt: Mapping[str, int], *, resumed
 
 def fresh(recipe: train_step.Recipe, seed: int) -> state.TrainState:
     """Draw the parameters of a run that begins."""
-    return state.create(compiling.draw(recipe.policy.init, seed), recipe.optimizer)
+    params = compiling.draw(recipe.policy.init, seed)
+    return compiling.step_by_step(lambda params: state.create(params, recipe.optimizer), params)
 
 
 def weights_to_start(config: Mapping[str, Any], recipe: train_step.Recipe) -> Any:

@@ -1,5 +1,6 @@
 """Programs are compiled once, counted right, and kept where the user's cache is."""
 
+import gc
 import os
 import resource
 import subprocess
@@ -226,6 +227,59 @@ def test_draw_gives_what_init_draws_and_compiles_no_draw_twice():
     jax.tree.map(lambda one, other: np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-7), drawn[1], whole)
     jax.tree.map(np.testing.assert_array_equal, drawn[1], again)
     jax.tree.map(np.testing.assert_array_equal, drawn[0], {"params": {name: more["params"][name] for name in drawn[0]["params"]}})
+
+
+class Mixed(nn.Module):
+    """Parameters of many shapes and kinds, of which NumPy makes some."""
+
+    @nn.compact
+    def __call__(self, x):
+        for width in (3, 70, 5):
+            x = nn.Conv(width, (3, 2))(nn.LayerNorm()(x))
+        start = nn.initializers
+        scale = self.param("scale", start.constant(8.0), ())
+        half = self.param("half", lambda key: start.normal(0.1)(key, (2, 3), jnp.bfloat16))
+        tall = self.param("tall", start.orthogonal(), (4, 4))
+        wide = self.param("wide", start.uniform(), (300, 7))
+        return x * scale, half, tall, wide, self.param("rows", lambda key: start.normal(1e-2)(key, (3, 1)) * jnp.arange(4.0))
+
+
+def test_draw_is_bit_for_bit_what_init_draws_alone():
+    """Though of random numbers only some sizes are drawn, and NumPy multiplies, repeats and copies."""
+    key, image = jax.random.key(3, impl="rbg"), jnp.ones((1, 9, 9, 2))
+    before = len(timing.compilations())
+    drawn = compiling.draw(Mixed().init, 3, image)
+    programs = len(timing.compilations()) - before
+    apart = Mixed().init(key, image)  # one operation after the other, as Flax does
+    assert len(timing.compilations()) - before > 2 * programs
+    for mine, theirs in zip(jax.tree.leaves(drawn), jax.tree.leaves(apart), strict=True):
+        assert isinstance(mine, jax.Array) and (mine.dtype, mine.weak_type) == (theirs.dtype, False)
+        np.testing.assert_array_equal(np.asarray(mine), np.asarray(theirs))
+    assert jax.tree.structure(drawn) == jax.tree.structure(apart)
+
+
+def test_step_by_step_copies_what_is_to_be_copied():
+    """One buffer for each result, so that each may be donated; an argument that is a result stays itself."""
+    x = jnp.arange(6.0)
+    same, copied, twice = compiling.step_by_step(lambda x: (x, jnp.array(x), jnp.broadcast_to(x * 2, (3, 6))), x)
+    assert same is x and copied.unsafe_buffer_pointer() != x.unsafe_buffer_pointer()
+    np.testing.assert_array_equal(copied, x)
+    np.testing.assert_array_equal(twice, np.tile(2 * np.arange(6.0), (3, 1)))
+
+
+@pytest.mark.parametrize("wanted", [True, False])
+def test_garbage_is_looked_for_again_after_compiling(wanted):
+    """If it was before; also after an error."""
+    was = gc.isenabled()
+    try:
+        gc.enable() if wanted else gc.disable()
+        seen = []
+        compiling.build(jax.jit(lambda x: [seen.append(gc.isenabled()), x + 1][1]), jnp.ones(2))
+        with pytest.raises(ZeroDivisionError):
+            compiling.step_by_step(lambda x: 1 // 0, jnp.ones(2))
+        assert seen == [False] and gc.isenabled() == wanted
+    finally:
+        gc.enable() if was else gc.disable()
 
 
 def test_step_by_step_leaves_out_what_no_result_needs():
