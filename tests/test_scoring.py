@@ -115,6 +115,24 @@ def test_parallel_changes_nothing(built, alone, parallel):
         np.testing.assert_allclose(one.poses[-1], many.poses[-1], atol=1e-4)
 
 
+@pytest.mark.parametrize("threads", [2, 3, 9])
+def test_episodes_side_by_side_are_as_one_after_another(built, monkeypatch, threads):
+    """The same actions and thoughts, by as many calls as there are threads, episodes and places; all of one program."""
+    scenes, calls = [built[2].task.sample(seed) for seed in SEEDS], []
+    starts = np.stack([one.start for one in scenes])
+    one, several = (scoring.PolicyAgent(*built, scenes, parallel=3, threads=n, key=jax.random.key(0)) for n in (1, threads))
+    real = scoring.act_batch
+    monkeypatch.setattr(scoring, "act_batch", lambda *given: [calls.append(given[-2:]), real(*given)][1])
+    for indices, spans in [([0, 1, 2], {2: [(0, 2), (2, 1)]}), ([2, 0], {}), ([1], {})]:
+        wanted = one(indices, starts[indices])
+        calls.clear()
+        jax.tree.map(np.testing.assert_array_equal, several(indices, starts[indices]), wanted)
+        assert sorted(calls) == spans.get(threads, [(i, 1) for i in range(len(indices))])
+    moments = [(0, starts[0]), (2, starts[2]), (1, starts[1]), (0, scenes[0].goal)]
+    for mine, theirs in zip(several.think_again(moments), one.think_again(moments), strict=True):
+        jax.tree.map(np.testing.assert_array_equal, mine, theirs)
+
+
 def test_summary_counts_what_happened(alone):
     summary, _, episodes = alone
     assert summary["episodes"] == 3 and summary["actions"] == sum(len(episode.actions) for episode in episodes)
