@@ -11,6 +11,7 @@ from typing import Any
 
 import jax
 import numpy as np
+import optax
 from rich import progress
 
 from lala_jax import checkpoint, cluster, compiling, options, parallel, state, writers
@@ -53,6 +54,11 @@ def session(out: pathlib.Path) -> Iterator[tuple[writers.Writer | None, Callable
     opened = writers.Writer(out) if parallel.is_first() else contextlib.nullcontext()
     with opened as writer, checkpoint.stop_signals((signal.SIGTERM, signal.SIGINT)) as stopped:
         yield writer, stopped
+
+
+def begin(params: Any, optimizer: optax.GradientTransformation) -> state.TrainState:
+    """Give the state of a run that begins with these parameters; quickly, as `compiling.step_by_step` does it."""
+    return compiling.step_by_step(lambda params: state.create(params, optimizer), params)
 
 
 def start_or_resume(

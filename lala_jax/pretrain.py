@@ -59,7 +59,7 @@ def start(config: Mapping[str, Any], recipe: pretrain_step.Recipe, states: types
     if name := config["pretrain"]["start"]:
         _, loaded = backbone.load(name, stage=recipe.model.stage)
         variables = {kind: {**tree, "encoder": loaded[kind]} for kind, tree in variables.items()}
-    return state.create(jax.tree.map(jnp.asarray, variables["params"]), recipe.optimizer), variables["batch_stats"]
+    return loop.begin(variables["params"], recipe.optimizer), variables["batch_stats"]
 
 
 def trunk(recipe: pretrain_step.Recipe, params: Mapping[str, Any], frozen: Mapping[str, Any]) -> tuple[resnet.ResNet50, dict[str, Any]]:

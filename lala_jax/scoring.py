@@ -95,12 +95,11 @@ class PolicyAgent:
         current = self._look(scenes, poses, rig)
 
         def act(part):
-            thought = act_batch(self._agent, self._most, self._params, scenes, poses, current, goal, int(part[0]), len(part))
+            thought = act_batch(self._agent, self._most, self._params, scenes, poses, current, goal, part.start, len(part))
             return len(part), jax.block_until_ready(thought)
 
-        parts = [part for part in np.array_split(np.arange(len(indices)), self._parts) if len(part)]
         with concurrent.futures.ThreadPoolExecutor(self._parts) as pool:
-            return current, list(pool.map(act, parts))
+            return current, list(pool.map(act, spans(len(indices), 1, self._parts)))
 
     def __call__(self, indices: Sequence[int], poses: np.ndarray) -> list[types.PickPlace]:
         _, thoughts = self._think(indices, poses)

@@ -63,8 +63,7 @@ def _note_start(config, out: pathlib.Path, learnt: Mapping[str, int], *, resumed
 
 def fresh(recipe: train_step.Recipe, seed: int) -> state.TrainState:
     """Draw the parameters of a run that begins."""
-    params = compiling.draw(recipe.policy.init, seed)
-    return compiling.step_by_step(lambda params: state.create(params, recipe.optimizer), params)
+    return loop.begin(compiling.draw(recipe.policy.init, seed), recipe.optimizer)
 
 
 def weights_to_start(config: Mapping[str, Any], recipe: train_step.Recipe) -> Any:
@@ -81,7 +80,7 @@ def start_or_resume(
     Raises CheckpointError where that is of a run with other settings. Files of pretrained weights may have been moved meanwhile: what is
     in them counts.
     """
-    begun = fresh(recipe, config["seed"]) if weights is None else state.create(weights, recipe.optimizer)
+    begun = fresh(recipe, config["seed"]) if weights is None else loop.begin(weights, recipe.optimizer)
     frozen = build.clip_identity(config) | build.backbone_identity(config)
     files = {field for name in frozen for field in build.FILES[name]}
 
